@@ -1,0 +1,1 @@
+"""The languages. Each module has `emit(programs)`: relative path below generated/ -> file text."""

@@ -1,0 +1,64 @@
+"""NumPy functions: trailing batch axes, results written into the arrays that are given."""
+
+from __future__ import annotations
+
+from epigauge_derive.emitters._text import (
+    argument_names,
+    families,
+    file_header,
+    indices,
+    kernel_header,
+    used_entries,
+)
+from epigauge_derive.printer import Printer
+from epigauge_derive.program import Assignments, Program, Repeat
+
+_printer = Printer(
+    {"sqrt": "np.sqrt", "sin": "np.sin", "cos": "np.cos", "atan2": "np.arctan2", "abs": "np.abs"},
+    select="np.where({condition} > 0.0, {then}, {other})",
+)
+
+
+def emit(programs: list[Program]) -> dict[str, str]:
+    """Write one module a family."""
+    files = {"epigauge_generated/numpy_backend/__init__.py": file_header("", "# {}")}
+    for family, members in families(programs).items():
+        text = file_header(family, "# {}") + "import numpy as np\n"
+        text += "".join(_function(program) for program in members)
+        files[f"epigauge_generated/numpy_backend/{family}.py"] = text
+    return files
+
+
+def _function(program: Program) -> str:
+    kernel = program.kernel
+    lines = ["", "", f"def {kernel.name}({', '.join(argument_names(kernel))}):"]
+    lines += [f"    # {line}" for line in kernel_header(program)]
+    for argument in kernel.inputs:
+        if argument.shape:
+            for _, index, name in used_entries(program, argument):
+                lines.append(f"    {name} = {argument.name}[{', '.join(map(str, index))}]")
+    for statement in program.statements:
+        lines += _statement(statement)
+    for output, results in zip(kernel.outputs, program.results, strict=True):
+        for index, expression in zip(indices(output.shape), results, strict=True):
+            place = ", ".join(map(str, index)) or "..."
+            value = _printer(expression)
+            if output.summed:
+                value = f"np.add.reduce({value}, axis=-1)"
+            lines.append(f"    {output.name}[{place}] = {value}")
+    return "\n".join(lines) + "\n"
+
+
+def _statement(statement: Assignments | Repeat) -> list[str]:
+    if not isinstance(statement, Repeat):
+        return _assignments(statement, "    ")
+    return [
+        *_assignments(statement.start, "    "),
+        f"    for _ in range({statement.passes}):",
+        *_assignments(statement.body, "        "),
+        *_assignments(statement.states, "        "),
+    ]
+
+
+def _assignments(assignments: Assignments, indent: str) -> list[str]:
+    return [f"{indent}{symbol.name} = {_printer(value)}" for symbol, value in assignments]

@@ -1,0 +1,103 @@
+"""The orthonormal representation F ~ U diag(1, sigma, 0) V^T and its minimal update (B&S 2004)."""
+
+from __future__ import annotations
+
+import sympy as sp
+
+from epigauge_derive.kernel import Input, Kernel, Output, at, jacobian
+from epigauge_derive.models.rotations import euler_rotation
+
+U, V, SIGMA = Input("U", (3, 3)), Input("V", (3, 3)), Input("sigma")
+DELTA = Input("delta", (7,))
+FACTORS = (U, V, SIGMA)
+
+
+def fundamental(u: sp.Matrix, v: sp.Matrix, sigma: sp.Expr) -> sp.Matrix:
+    """Return F = u1 v1^T + sigma u2 v2^T, B&S eq. (2)."""
+    return u[:, 0] * v[:, 0].T + sigma * u[:, 1] * v[:, 1].T
+
+
+def canonical_camera(u: sp.Matrix, v: sp.Matrix, sigma: sp.Expr) -> sp.Matrix:
+    """Return the canonic second camera P' = (u2 v1^T - sigma u1 v2^T | u3), B&S eq. (5).
+
+    Obtained as the paper obtains it, from ([e']_x F | e') with e' = u3; the products
+    [u3]_x u1 = u2 and [u3]_x u2 = -u1 hold for a right-handed U, and for a left-handed one the
+    camera is the canonic one of -F.
+    """
+    plane_homography = u[:, 1] * v[:, 0].T - sigma * u[:, 0] * v[:, 1].T
+    return plane_homography.row_join(u[:, 2])
+
+
+def updated() -> tuple[sp.Matrix, sp.Matrix, sp.Expr]:
+    """Return (U R(x), V R(y), sigma + delta_sigma), the update of B&S eq. (3)."""
+    delta = DELTA.entries()
+    return (
+        U.matrix() * euler_rotation(delta[:3]),
+        V.matrix() * euler_rotation(delta[3:6]),
+        SIGMA.symbol() + delta[6],
+    )
+
+
+def derivatives_at_zero(values: sp.Matrix) -> sp.Matrix:
+    """Differentiate by the seven update parameters, at no update."""
+    delta = DELTA.entries()
+    return at(jacobian(list(values), delta), dict.fromkeys(delta, 0))
+
+
+def second_derivatives_at_zero(values: sp.Matrix) -> list[list[list[sp.Expr]]]:
+    """Differentiate twice by the seven update parameters, at no update."""
+    delta = DELTA.entries()
+    still = dict.fromkeys(delta, 0)
+    return [[[at(sp.diff(e, a, b), still) for b in delta] for a in delta] for e in values]
+
+
+def kernels() -> list[Kernel]:
+    """Return F, its derivatives, the canonic camera, A_perp and the update."""
+    plain = (U.matrix(), V.matrix(), SIGMA.symbol())
+    F, camera = fundamental(*updated()), canonical_camera(*updated())
+    u_new, v_new, sigma_new = updated()
+    return [
+        Kernel(
+            "fundamental_from_factors",
+            "F = u1 v1^T + sigma u2 v2^T (B&S eq. 2).",
+            FACTORS,
+            (Output.of("F", fundamental(*plain)),),
+        ),
+        Kernel(
+            "fundamental_derivatives",
+            "F (B&S eq. 2) with first and second derivatives of vect(F) by the seven update "
+            "parameters of B&S eq. (3), at no update.",
+            FACTORS,
+            (
+                Output.of("F", fundamental(*plain)),
+                Output.of("dF", derivatives_at_zero(F)),
+                Output.of("d2F", second_derivatives_at_zero(F)),
+            ),
+        ),
+        Kernel(
+            "canonical_camera",
+            "P' = (u2 v1^T - sigma u1 v2^T | u3) (B&S eq. 5).",
+            FACTORS,
+            (Output.of("P2", canonical_camera(*plain)),),
+        ),
+        Kernel(
+            "canonical_camera_derivatives",
+            "P' (B&S eq. 5) and A_perp = d vect(P') / d (x, y, sigma), obtained by "
+            "differentiating eq. (5) through the update of eq. (3) (B&S eqs. 6, 7).",
+            FACTORS,
+            (
+                Output.of("P2", canonical_camera(*plain)),
+                Output.of("A_perp", derivatives_at_zero(camera)),
+            ),
+        ),
+        Kernel(
+            "retract_factors",
+            "U <- U R(x), V <- V R(y), sigma <- sigma + delta_sigma (B&S eq. 3).",
+            (*FACTORS, DELTA),
+            (
+                Output.of("U_new", u_new),
+                Output.of("V_new", v_new),
+                Output.of("sigma_new", sigma_new),
+            ),
+        ),
+    ]

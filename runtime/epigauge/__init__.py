@@ -1,0 +1,38 @@
+"""Geometry of uncalibrated images: maximum-likelihood fundamental matrices and their uncertainty.
+
+>>> import epigauge as eg
+>>> result = eg.refine_fundamental(x1, x2)  # doctest: +SKIP
+>>> result.F, result.rms_px, result.covariance  # doctest: +SKIP
+"""
+
+from epigauge import kernels
+from epigauge.errors import ArgumentError, BackendError, EpigaugeError, FileFormatError
+from epigauge.kernels import backend, set_backend
+from epigauge.two_view.geometry import (
+    canonical_cameras,
+    reprojection_distances,
+    sampson_distances,
+    triangulate,
+)
+from epigauge.two_view.initial import fundamental_8point
+from epigauge.two_view.refine import refine_fundamental
+from epigauge.two_view.result import FundamentalResult
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "ArgumentError",
+    "BackendError",
+    "EpigaugeError",
+    "FileFormatError",
+    "FundamentalResult",
+    "backend",
+    "canonical_cameras",
+    "fundamental_8point",
+    "kernels",
+    "refine_fundamental",
+    "reprojection_distances",
+    "sampson_distances",
+    "set_backend",
+    "triangulate",
+]

@@ -1,0 +1,373 @@
+"""Conversion and checks of arguments: done once, at the border of the library.
+
+Each function returns the value in the one form that the rest of the library works with, or raises
+`ArgumentError`, which names the argument, what it was and what is needed. No input is ever changed.
+"""
+
+from __future__ import annotations
+
+import difflib
+import operator
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge.errors import ArgumentError
+
+__all__ = [
+    "as_choice",
+    "as_count",
+    "as_fundamental",
+    "as_matches",
+    "as_positive",
+    "as_weights",
+    "check_general_position",
+]
+
+Array = NDArray[np.float64]
+
+_POINTS = "an (m, 2) array of pixel coordinates"
+
+#: A point set is collinear when its thickness is below this fraction of its length. Image points
+#: are never measured to 1e-7 of an image, and text files round there.
+_THIN = 1e-7
+
+
+def as_matches(
+    x1: ArrayLike,
+    x2: ArrayLike,
+    *,
+    at_least: int = 8,
+    general_position: bool = False,
+) -> tuple[Array, Array]:
+    """Check point matches and bring them into the form used inside.
+
+    Parameters
+    ----------
+    x1, x2 : array_like, shape (m, 2) or (m, 1, 2)
+        Matching points in image 1 and 2, in pixels; any integer or floating type, or lists.
+    at_least : int
+        Smallest number of matches accepted.
+    general_position : bool
+        Refuse points that are all equal or all on one line of an image.
+
+    Returns
+    -------
+    x1, x2 : ndarray, shape (m, 2), float64, C-contiguous
+        The caller's own array where that is already in this form: do not write into it.
+
+    Raises
+    ------
+    ArgumentError
+        On another shape, unequal lengths, NaN or infinity (the first such row is named), a type
+        that is not a real number, fewer than `at_least` matches and, with `general_position`,
+        points without extent in two dimensions.
+    """
+    a1, a2 = _points("x1", x1), _points("x2", x2)
+    if len(a1) != len(a2):
+        raise ArgumentError(
+            "x2", f"has {len(a2)} points but x1 has {len(a1)}", "one row in each for every match"
+        )
+    if len(a1) < at_least:
+        raise ArgumentError("x1, x2", f"hold {_number(len(a1), 'match')}", f"at least {at_least}")
+    if general_position:
+        for name, given, points in (("x1", x1, a1), ("x2", x2, a2)):
+            check_general_position(name, points, eps=_resolution(given))
+    return a1, a2
+
+
+def check_general_position(name: str, points: Array, *, eps: float = 2.0**-52) -> None:
+    """Refuse points that are all equal or all on one line.
+
+    With s1 the root mean square distance from the centroid, s2 that from the line through the
+    centroid and the point farthest from it, and r = 4 * eps * (largest coordinate) the rounding of
+    the input, the points count as equal when ``s1 <= r`` and as collinear when
+    ``s2 <= max(r, 1e-7 * s1)``. Centring comes first, so that a large offset of the coordinates
+    does not hide the extent of the points.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument for the message.
+    points : ndarray, shape (m, 2)
+        Finite points of one image.
+    eps : float
+        Relative rounding of the coordinates as the caller gave them.
+
+    Raises
+    ------
+    ArgumentError
+        If the points have no extent, or extent in one direction only.
+    """
+    if _is_spread(points, eps):
+        return
+    size = float(np.max(np.abs(points), initial=0.0))
+    equal = collinear = True
+    if size > 0.0:
+        # Dividing by a power of two is exact and keeps squares from overflowing.
+        scaled = np.ldexp(points, -int(np.frexp(size)[1]))
+        x, y = (scaled - scaled[0]).T
+        x, y = x - x.mean(), y - y.mean()
+        squared = x * x + y * y
+        far = np.argmax(squared)
+        s1, rounding = np.sqrt(squared.mean()), 4.0 * eps
+        equal = bool(s1 <= rounding)
+        if not equal:
+            off_line = (x * y[far] - y * x[far]) / np.sqrt(squared[far])
+            collinear = bool(np.sqrt(np.mean(off_line**2)) <= max(rounding, _THIN * s1))
+    if equal or collinear:
+        image = {"x1": " of image 1", "x2": " of image 2"}.get(name, "")
+        raise ArgumentError(
+            name,
+            f"has all its points{image} {'equal' if equal else 'on one line'}",
+            "points spread over two dimensions in both images, else F is not determined",
+        )
+
+
+def as_choice(name: str, value: object, choices: Iterable[str]) -> str:
+    """Check that an option is one of the strings allowed.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument for the message.
+    value : object
+        What the caller gave.
+    choices : iterable of str
+        What is allowed.
+
+    Returns
+    -------
+    str
+        The value.
+
+    Raises
+    ------
+    ArgumentError
+        If the value is not among the choices; the message suggests a similar one.
+    """
+    allowed = list(choices)
+    if isinstance(value, str) and value in allowed:
+        return value
+    listed = ", ".join(repr(choice) for choice in allowed)
+    needed = listed if len(allowed) == 1 else f"one of {listed}"
+    if isinstance(value, str):
+        close = difflib.get_close_matches(value.lower(), allowed, n=1)
+        if close:
+            needed += f" (did you mean {close[0]!r}?)"
+    raise ArgumentError(name, f"is {_shown(value)}", needed)
+
+
+def as_fundamental(F0: ArrayLike, name: str = "F0") -> Array:
+    """Check a fundamental matrix: real, finite, not zero.
+
+    Parameters
+    ----------
+    F0 : array_like, shape (3, 3)
+        The matrix. Its rank and scale are the business of the caller.
+    name : str
+        Name of the argument for the message.
+
+    Returns
+    -------
+    ndarray, shape (3, 3), float64
+        A matrix that may share memory with the input: do not write into it.
+
+    Raises
+    ------
+    ArgumentError
+        On another shape or type, NaN, infinity, or a matrix of zeros.
+    """
+    F = _real(name, F0, "a (3, 3) matrix")
+    if F.shape != (3, 3):
+        raise ArgumentError(name, f"has shape {F.shape}", "a (3, 3) matrix")
+    if not np.isfinite(F).all():
+        row, column = np.argwhere(~np.isfinite(F))[0]
+        raise ArgumentError(name, f"has {F[row, column]} at [{row}, {column}]", "finite entries")
+    if not F.any():
+        raise ArgumentError(name, "is the zero matrix", "a matrix of rank 2")
+    return F
+
+
+def as_positive(name: str, value: object, *, zero: bool = False) -> float:
+    """Check a positive finite number.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument for the message.
+    value : object
+        What the caller gave; any real scalar type but bool.
+    zero : bool
+        Accept zero as well.
+
+    Returns
+    -------
+    float
+        The number.
+
+    Raises
+    ------
+    ArgumentError
+        If it is not a number, not finite, or not positive.
+    """
+    needed = "a finite number >= 0" if zero else "a finite number > 0"
+    try:
+        scalar = np.asarray(value)
+        if scalar.ndim != 0 or scalar.dtype.kind not in "iuf":
+            raise TypeError
+        number = float(scalar)
+    except (TypeError, ValueError, OverflowError):
+        raise ArgumentError(name, f"is {_shown(value)}", needed) from None
+    if not np.isfinite(number) or number < 0.0 or (number == 0.0 and not zero):
+        raise ArgumentError(name, f"is {number!r}", needed)
+    return number
+
+
+def as_count(name: str, value: object, *, at_least: int = 1) -> int:
+    """Check a whole number with a lower bound.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument for the message.
+    value : object
+        What the caller gave; any integer type but bool.
+    at_least : int
+        Smallest number accepted.
+
+    Returns
+    -------
+    int
+        The number.
+
+    Raises
+    ------
+    ArgumentError
+        If it is not an integer, or too small.
+    """
+    needed = f"an integer >= {at_least}"
+    if isinstance(value, bool | np.bool_):
+        raise ArgumentError(name, f"is {_shown(value)}", needed)
+    try:
+        number = operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        raise ArgumentError(name, f"is {_shown(value)}", needed) from None
+    if number < at_least:
+        raise ArgumentError(name, f"is {number}", needed)
+    return number
+
+
+def as_weights(weights: ArrayLike, m: int) -> Array:
+    """Check the weights of matches.
+
+    Parameters
+    ----------
+    weights : array_like, shape (m,)
+        One weight a match.
+    m : int
+        Number of matches.
+
+    Returns
+    -------
+    ndarray, shape (m,), float64
+        Weights that may share memory with the input: do not write into them.
+
+    Raises
+    ------
+    ArgumentError
+        On another shape or type, a negative, infinite or NaN weight (the first is named), or
+        weights that are all zero.
+    """
+    w = _real("weights", weights, f"an ({m},) array")
+    if w.shape != (m,):
+        raise ArgumentError("weights", f"has shape {w.shape}", f"({m},): one weight a match")
+    bad = np.flatnonzero(~(np.isfinite(w) & (w >= 0.0)))
+    if len(bad):
+        raise ArgumentError("weights", f"has {w[bad[0]]} in row {bad[0]}", "finite numbers >= 0")
+    if m and not w.any():
+        raise ArgumentError("weights", "is zero for every match", "some positive weights")
+    return w
+
+
+def _points(name: str, value: ArrayLike) -> Array:
+    """Convert one image's points to (m, 2), float64, C-contiguous."""
+    points = _real(name, value, _POINTS)
+    if points.ndim == 3 and points.shape[1:] == (1, 2):
+        points = points[:, 0, :]
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise ArgumentError(name, f"has shape {points.shape}", _POINTS + _hint(points.shape))
+    finite = np.isfinite(points)
+    if not finite.all():
+        row = int(np.flatnonzero(~finite.all(axis=1))[0])
+        x, y = points[row]
+        raise ArgumentError(
+            name, f"has a point ({x}, {y}) in row {row}", "finite coordinates: drop such matches"
+        )
+    return np.ascontiguousarray(points)
+
+
+def _is_spread(points: Array, eps: float) -> bool:
+    """Recognise plainly two-dimensional points in a few microseconds; False means: look closer.
+
+    The determinant and trace of the scatter matrix show a thickness above a thousandth of the
+    length and far above rounding. Coordinates outside [1e-70, 1e70] are left to the close look.
+    """
+    m = len(points)
+    with np.errstate(over="ignore", invalid="ignore"):
+        mean = np.add.reduce(points) / max(m, 1)
+        centred = points - mean
+        scatter = centred.T @ centred
+    mx, my, a, b, c = map(float, (*mean, scatter[0, 0], scatter[0, 1], scatter[1, 1]))
+    trace, determinant = a + c, a * c - b * b
+    return (
+        1e-140 < trace < 1e140
+        and determinant > 1e-6 * trace * trace
+        and determinant > (1e3 * eps) ** 2 * m * trace * (mx * mx + my * my + trace)
+    )
+
+
+def _real(name: str, value: ArrayLike, needed: str) -> Array:
+    """Convert to float64, refusing every type that is not a real number."""
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
+        raise ArgumentError(name, "is a masked array", f"{needed} without masked entries")
+    try:
+        array = np.asarray(value)
+    except (ValueError, TypeError) as error:
+        raise ArgumentError(name, "is not a regular array", f"{needed} ({error})") from None
+    if array.dtype.kind not in "iuf":
+        raise ArgumentError(name, f"has type {array.dtype}", f"{needed} of real numbers")
+    with np.errstate(over="ignore"):  # a long double beyond float64 becomes inf: refused later
+        return array.astype(np.float64, copy=False)
+
+
+def _resolution(value: Any) -> float:
+    """Relative rounding of the caller's numbers: that of their floating type."""
+    dtype = getattr(value, "dtype", None)
+    if not isinstance(dtype, np.dtype) or dtype.kind != "f":
+        return 2.0**-52
+    return max(2.0**-52, float(np.finfo(dtype).eps))
+
+
+def _hint(shape: tuple[int, ...]) -> str:
+    """Say how a common wrong shape is repaired."""
+    if len(shape) == 2 and shape[0] == 2:
+        return " (transpose it)"
+    if len(shape) == 2 and shape[1] == 3:
+        return " (divide homogeneous points by their third coordinate and drop it)"
+    if len(shape) == 2 and shape[1] == 4:
+        return " (pass columns 0, 1 as x1 and columns 2, 3 as x2)"
+    return ""
+
+
+def _shown(value: object) -> str:
+    """Print a caller's value, cut to a readable length."""
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _number(count: int, noun: str) -> str:
+    """Count with the right plural: 1 match, 2 matches."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}es"

@@ -1,0 +1,170 @@
+"""Linear systems that a Levenberg-Marquardt step solves, and the dampings over them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.lm import System
+
+__all__ = ["Arrow", "Dense", "Levenberg", "Seber"]
+
+Array = NDArray[np.float64]
+
+#: A direction of negative curvature is lifted this far above zero, relative to the curvature.
+_LIFT = 1e-3
+
+
+@dataclass(frozen=True)
+class Levenberg:
+    """Damping lambda I, called LM in B&S; the first lambda is relative to the largest diagonal."""
+
+    relative: float = 1e-3
+
+    def start(self, system: System) -> float:
+        """Return `relative` times the largest diagonal entry."""
+        return self.relative * max(system.largest(), 1e-300)
+
+    def step(self, system: System, lam: float) -> Array:
+        """Return -(H + lam I)^-1 g."""
+        return system.solve(lam, scaled=False)
+
+
+@dataclass(frozen=True)
+class Seber:
+    """Damping lambda diag(J^T J), called SEBER in B&S: the diagonal is multiplied by 1 + lambda."""
+
+    relative: float = 1e-3
+
+    def start(self, system: System) -> float:
+        """Return `relative`, since this damping scales with the system."""
+        return self.relative
+
+    def step(self, system: System, lam: float) -> Array:
+        """Return -(H + lam diag(J^T J))^-1 g."""
+        return system.solve(lam, scaled=True)
+
+
+@dataclass(frozen=True)
+class Dense:
+    """A small dense system, its Hessian possibly indefinite.
+
+    Attributes
+    ----------
+    gradient : ndarray, shape (p,)
+        Gradient of the cost.
+    hessian : ndarray, shape (p, p)
+        Exact Hessian, or the Gauss-Newton matrix J^T J.
+    diagonal : ndarray, shape (p,)
+        Diagonal of J^T J, positive: the scale of each parameter.
+    """
+
+    gradient: Array
+    hessian: Array
+    diagonal: Array
+
+    def largest(self) -> float:
+        """Return the largest diagonal entry of J^T J."""
+        return float(np.max(self.diagonal))
+
+    def solve(self, lam: float, *, scaled: bool) -> Array:
+        """Solve in the eigenbasis; lambda is lifted until the damped Hessian is definite."""
+        scale, values, vectors = self._scaled if scaled else self._plain
+        lowest = values[0] + lam
+        shift = lam if lowest > 0.0 else lam - (1.0 + _LIFT) * values[0]
+        damped = np.maximum(values + shift, np.finfo(float).tiny)
+        projected = vectors.T @ (self.gradient / scale)
+        return np.asarray(-(vectors @ (projected / damped)) / scale)
+
+    def predicted(self, step: Array) -> float:
+        """Return -(g^T step + step^T H step / 2)."""
+        return float(-(self.gradient @ step + 0.5 * step @ self.hessian @ step))
+
+    def decrement(self) -> float:
+        """Return g^T H^-1 g / 2; infinity where H is not positive definite."""
+        _, values, vectors = self._plain
+        if values[0] <= np.finfo(float).eps * values[-1]:
+            return float("inf")
+        return float(0.5 * np.sum((vectors.T @ self.gradient) ** 2 / values))
+
+    @cached_property
+    def _plain(self) -> tuple[Array, Array, Array]:
+        values, vectors = np.linalg.eigh(self.hessian)
+        return np.ones_like(self.gradient), values, vectors
+
+    @cached_property
+    def _scaled(self) -> tuple[Array, Array, Array]:
+        floor = np.finfo(float).eps * max(self.largest(), np.finfo(float).tiny)
+        scale = np.sqrt(np.maximum(self.diagonal, floor))
+        values, vectors = np.linalg.eigh(self.hessian / np.outer(scale, scale))
+        return scale, values, vectors
+
+
+@dataclass(frozen=True)
+class Arrow:
+    """Normal equations of motion and structure; points couple with the motion only.
+
+    ``[[U, W], [W^T, V]]`` with V block diagonal; the points are eliminated (Schur complement).
+
+    Attributes
+    ----------
+    U : ndarray, shape (p, p)
+        Motion block of J^T J.
+    W : ndarray, shape (m, p, k)
+        Coupling of the motion with each point.
+    V : ndarray, shape (m, k, k)
+        Block of each point.
+    g_motion : ndarray, shape (p,)
+        Gradient by the motion.
+    g_points : ndarray, shape (m, k)
+        Gradient by each point.
+    """
+
+    U: Array
+    W: Array
+    V: Array
+    g_motion: Array
+    g_points: Array
+
+    @cached_property
+    def gradient(self) -> Array:
+        """Return motion part, then the points one after the other."""
+        return np.concatenate([self.g_motion, self.g_points.ravel()])
+
+    def largest(self) -> float:
+        """Return the largest diagonal entry."""
+        points = np.einsum("mkk->mk", self.V)
+        return float(max(np.max(np.diag(self.U)), np.max(points)))
+
+    def solve(self, lam: float, *, scaled: bool) -> Array:
+        """Solve by the Schur complement of the points."""
+        k = self.V.shape[1]
+        if scaled:
+            U = self.U + lam * np.diag(np.diag(self.U))
+            V = self.V * (1.0 + lam * np.eye(k))
+        else:
+            U = self.U + lam * np.eye(len(self.U))
+            V = self.V + lam * np.eye(k)
+        inverse = np.linalg.inv(V)
+        Y = self.W @ inverse
+        reduced = U - np.einsum("mpk,mqk->pq", Y, self.W)
+        right = -self.g_motion + np.einsum("mpk,mk->p", Y, self.g_points)
+        motion = np.linalg.solve(reduced, right)
+        coupled = self.g_points + np.einsum("mpk,p->mk", self.W, motion)
+        points = -np.einsum("mkl,ml->mk", inverse, coupled)
+        return np.concatenate([motion, points.ravel()])
+
+    def predicted(self, step: Array) -> float:
+        """Return -(g^T step + step^T N step / 2)."""
+        p = len(self.g_motion)
+        a, b = step[:p], step[p:].reshape(self.g_points.shape)
+        curvature = a @ self.U @ a + 2.0 * np.einsum("p,mpk,mk->", a, self.W, b, optimize=True)
+        curvature += np.einsum("mk,mkl,ml->", b, self.V, b, optimize=True)
+        return float(-(self.gradient @ step + 0.5 * curvature))
+
+    def decrement(self) -> float:
+        """Return infinity: J^T J may be singular by a free gauge."""
+        return float("inf")

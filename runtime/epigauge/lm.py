@@ -1,0 +1,328 @@
+"""The one Levenberg-Marquardt loop: problem + damping + schedule + linear system.
+
+A *problem* evaluates the cost of an estimate, linearises it into a linear system, and retracts a
+step. A *damping* turns the system and lambda into a step, a *schedule* chooses lambda. Every method
+that epigauge compares is a combination of such parts.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.errors import ArgumentError
+
+__all__ = [
+    "STATUS",
+    "Classic",
+    "Damping",
+    "Nielsen",
+    "Outcome",
+    "Problem",
+    "Row",
+    "Schedule",
+    "State",
+    "Stopping",
+    "System",
+    "minimize",
+]
+
+Array = NDArray[np.float64]
+
+#: Meaning of `status`; positive is success.
+STATUS = {
+    -3: "the cost at the start is not finite",
+    -2: "stopped by the callback",
+    -1: "no step reduces the cost any further although lambda is at its ceiling",
+    0: "max_iter trial steps taken without convergence",
+    1: "converged: gradient below gtol",
+    2: "converged: relative decrease of the cost below ftol",
+    3: "converged: step below xtol",
+    4: "converged: the decrease still to be expected is below ftol",
+    5: "converged: the cost is at the rounding of the data",
+}
+
+_LAM_CEILING = 1e16
+
+
+class State(Protocol):
+    """What a problem knows about one estimate; at least its cost, 0.5 * sum of squares."""
+
+    @property
+    def cost(self) -> float:
+        """Return the cost."""
+
+
+S = TypeVar("S", bound=State)
+
+
+class System(Protocol):
+    """A problem linearised at one estimate: gradient, (approximate) Hessian and how to solve."""
+
+    @property
+    def gradient(self) -> Array:
+        """Return the gradient of the cost."""
+
+    def largest(self) -> float:
+        """Return the largest diagonal entry of the Hessian."""
+
+    def solve(self, lam: float, *, scaled: bool) -> Array:
+        """Return -(H + lam W)^-1 g, with W = I or, if scaled, W = diag(J^T J)."""
+
+    def predicted(self, step: Array) -> float:
+        """Return the decrease of the cost that the quadratic model promises for a step."""
+
+    def decrement(self) -> float:
+        """Return the decrease promised by the undamped step; infinity where it is not known."""
+
+
+class Problem(Protocol[S]):
+    """A cost function over estimates of any kind."""
+
+    #: A cost this low is rounding error.
+    floor: float
+
+    def evaluate(self, estimate: Any) -> S:
+        """Return the state of an estimate; a cost of infinity rejects it."""
+
+    def linearize(self, state: S) -> System:
+        """Return the linear system at a state."""
+
+    def retract(self, state: S, step: Array) -> Any:
+        """Return the estimate that a step leads to."""
+
+
+class Damping(Protocol):
+    """Turns a linear system and lambda into a step."""
+
+    def start(self, system: System) -> float:
+        """Return the first lambda."""
+
+    def step(self, system: System, lam: float) -> Array:
+        """Return the step."""
+
+
+class Schedule(Protocol):
+    """Chooses lambda after each trial step; `ratio` is the actual over the predicted decrease."""
+
+    def accepted(self, lam: float, ratio: float) -> float:
+        """Return the next lambda after a step that reduced the cost."""
+
+    def rejected(self, lam: float) -> float:
+        """Return the next lambda after a step that did not."""
+
+
+@dataclass
+class Classic:
+    """Divide or multiply lambda by a constant factor: both papers' rule."""
+
+    factor: float = 10.0
+
+    def accepted(self, lam: float, ratio: float) -> float:
+        """Divide lambda by the factor."""
+        return lam / self.factor
+
+    def rejected(self, lam: float) -> float:
+        """Multiply lambda by the factor."""
+        return lam * self.factor
+
+
+@dataclass
+class Nielsen:
+    """Nielsen's rule: lambda shrinks smoothly with the gain ratio, and grows ever faster.
+
+    References
+    ----------
+    .. [1] H. B. Nielsen, "Damping parameter in Marquardt's method", IMM-REP-1999-05, 1999.
+    """
+
+    growth: float = 2.0
+
+    def accepted(self, lam: float, ratio: float) -> float:
+        """Multiply lambda by max(1/3, 1 - (2 ratio - 1)^3)."""
+        self.growth = 2.0
+        return lam * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
+
+    def rejected(self, lam: float) -> float:
+        """Multiply lambda by a factor that doubles with each rejection."""
+        lam *= self.growth
+        self.growth *= 2.0
+        return lam
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """When to stop; tolerances are compared as written in `minimize`.
+
+    Attributes
+    ----------
+    ftol : float
+        Relative decrease of the cost.
+    xtol : float
+        Length of an accepted step in the units of the parameterisation.
+    gtol : float
+        Largest absolute entry of the gradient.
+    max_iter : int
+        Trial steps, accepted or rejected.
+    """
+
+    ftol: float = 1e-10
+    xtol: float = 1e-12
+    gtol: float = 1e-14
+    max_iter: int = 100
+
+    def __post_init__(self) -> None:
+        for name in ("ftol", "xtol", "gtol"):
+            value = getattr(self, name)
+            if not (isinstance(value, float | int) and 0.0 <= value < 1.0):
+                raise ArgumentError(name, f"is {value!r}", "a number in [0, 1)")
+        if not isinstance(self.max_iter, int | np.integer) or self.max_iter < 1:
+            raise ArgumentError("max_iter", f"is {self.max_iter!r}", "an integer of at least 1")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One evaluation of the cost: row 0 is the start, every other one a trial step.
+
+    Attributes
+    ----------
+    iteration : int
+        Number of the trial step.
+    cost : float
+        Cost of the trial, whether accepted or not.
+    lam : float
+        Damping the step was made with; NaN never occurs, the start has 0.
+    step_norm : float
+        Euclidean length of the step in the units of the parameterisation.
+    accepted : bool
+        Whether the trial became the estimate.
+    seconds : float
+        Time since the start of the minimisation.
+    """
+
+    iteration: int
+    cost: float
+    lam: float
+    step_norm: float
+    accepted: bool
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Outcome(Generic[S]):
+    """Where a minimisation ended: state, linear system there, counts, reason and history."""
+
+    state: S
+    system: System
+    nfev: int
+    njev: int
+    nit: int
+    status: int
+    history: tuple[Row, ...]
+
+
+def minimize(
+    problem: Problem[S],
+    start: Any,
+    damping: Damping,
+    schedule: Schedule,
+    stopping: Stopping,
+    callback: Callable[[Row], object] | None = None,
+    scale: float = 1.0,
+) -> Outcome[S]:
+    """Minimise a cost by damped steps.
+
+    Parameters
+    ----------
+    problem, damping, schedule, stopping
+        The parts.
+    start : estimate
+        Where to begin.
+    callback : callable, optional
+        Called with each `Row`; a true return value stops the minimisation.
+    scale : float
+        Factor from the problem's cost to the unit that the history is told in.
+
+    Returns
+    -------
+    Outcome
+        The best state, never worse than the start.
+
+    Notes
+    -----
+    With c the cost, dc > 0 the decrease of an accepted step and g the gradient, the loop ends when
+
+    - ``max|g| <= gtol`` (status 1),
+    - ``dc <= ftol * c`` (2),
+    - ``|step| <= xtol`` for an accepted step (3),
+    - ``decrement <= ftol * c`` before a step, the decrement being the decrease that the undamped
+      quadratic model still promises (4); not all linear systems know it,
+    - ``c <= problem.floor`` (5), or a step neither lowers nor raises the cost beyond
+      ``1e-15 * c`` (2): then rounding decides.
+    """
+    begun = time.perf_counter()
+    state = problem.evaluate(start)
+    history: list[Row] = []
+    njev, iteration = 0, 0
+
+    def record(cost: float, lam: float, norm: float, accepted: bool) -> bool:
+        seconds = time.perf_counter() - begun
+        history.append(Row(iteration, cost * scale, lam, norm, accepted, seconds))
+        return bool(callback(history[-1])) if callback is not None else False
+
+    stop = record(state.cost, 0.0, 0.0, True)
+    system = problem.linearize(state)
+    njev += 1
+    lam = damping.start(system)
+
+    def outcome(status: int) -> Outcome[S]:
+        counts = (len(history), njev, iteration)
+        return Outcome(state, system, *counts, status, tuple(history))
+
+    if stop:
+        return outcome(-2)
+    if not math.isfinite(state.cost):
+        return outcome(-3)
+    while True:
+        if state.cost <= problem.floor:
+            return outcome(5)
+        if float(np.max(np.abs(system.gradient))) <= stopping.gtol:
+            return outcome(1)
+        if system.decrement() <= stopping.ftol * state.cost:
+            return outcome(4)
+        while True:
+            if iteration >= stopping.max_iter:
+                return outcome(0)
+            iteration += 1
+            step = damping.step(system, lam)
+            trial = problem.evaluate(problem.retract(state, step))
+            decrease = state.cost - trial.cost
+            norm = float(np.linalg.norm(step))
+            accepted = decrease > 0.0
+            stop = record(trial.cost, lam, norm, accepted)
+            if accepted:
+                break
+            if stop:
+                return outcome(-2)
+            if abs(decrease) <= 1e-15 * state.cost:
+                return outcome(2)
+            lam = schedule.rejected(lam)
+            if lam > _LAM_CEILING * max(system.largest(), 1e-300):
+                return outcome(-1)
+        predicted = system.predicted(step)
+        lam = schedule.accepted(lam, decrease / predicted if predicted > 0.0 else 1.0)
+        state = trial
+        system = problem.linearize(state)
+        njev += 1
+        if stop:
+            return outcome(-2)
+        if decrease <= stopping.ftol * state.cost:
+            return outcome(2)
+        if norm <= stopping.xtol:
+            return outcome(3)

@@ -1,0 +1,1 @@
+"""Two views: from point matches to the maximum-likelihood fundamental matrix."""

@@ -1,0 +1,117 @@
+"""Coordinates to compute in: one isotropic scale for both images, so that the minimum stays.
+
+Scaling the two images by different factors would change the noise model and hence the answer; a
+common factor and separate origins do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Conditioning", "condition", "displaced"]
+
+Array = NDArray[np.float64]
+
+#: Root mean square of a conditioned coordinate; `benchmarks/evaluations.py` compares others.
+RMS = 2.0
+
+#: How far the second origin is moved off the centroid, in conditioned units (half the RMS).
+OFFSET = 1.0
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """Maps pixels to conditioned coordinates: (x - origin) / scale in each image.
+
+    Attributes
+    ----------
+    origin1, origin2 : ndarray, shape (2,)
+        Origins in pixels.
+    scale : float
+        Pixels a unit, the same in both images.
+    """
+
+    origin1: Array
+    origin2: Array
+    scale: float
+
+    def forward(self, x1: Array, x2: Array) -> tuple[Array, Array]:
+        """Return both point sets conditioned and observation-last, shape (2, m)."""
+        q1 = np.ascontiguousarray(((x1 - self.origin1) / self.scale).T)
+        q2 = np.ascontiguousarray(((x2 - self.origin2) / self.scale).T)
+        return q1, q2
+
+    def backward(self, q1: Array, q2: Array) -> tuple[Array, Array]:
+        """Return conditioned points as pixels, shape (m, 2)."""
+        return q1.T * self.scale + self.origin1, q2.T * self.scale + self.origin2
+
+    def from_pixels(self, F: Array) -> Array:
+        """Return the conditioned F with unit Frobenius norm."""
+        conditioned = self._pixels_from(self.origin2).T @ F @ self._pixels_from(self.origin1)
+        return np.asarray(conditioned / np.linalg.norm(conditioned))
+
+    def to_pixels(self, F: Array) -> Array:
+        """Return F for pixels, with unit Frobenius norm."""
+        pixels = (self.entry_map() @ F.ravel()).reshape(3, 3)
+        return np.asarray(pixels / np.linalg.norm(pixels))
+
+    def entry_map(self) -> Array:
+        """Return the (9, 9) matrix from vect(F) conditioned to vect(F) for pixels."""
+        return np.kron(self._to_units(self.origin2).T, self._to_units(self.origin1).T)
+
+    def _to_units(self, origin: Array) -> Array:
+        x, y = origin
+        return np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, self.scale]]) / self.scale
+
+    def _pixels_from(self, origin: Array) -> Array:
+        x, y = origin
+        return np.array([[self.scale, 0.0, x], [0.0, self.scale, y], [0.0, 0.0, 1.0]])
+
+
+def condition(x1: Array, x2: Array) -> Conditioning:
+    """Centre both images and scale them by one factor to coordinates of RMS 2.
+
+    Parameters
+    ----------
+    x1, x2 : ndarray, shape (m, 2)
+        Matches in pixels, not all equal.
+
+    Returns
+    -------
+    Conditioning
+        Origins at the centroids.
+    """
+    origin1, origin2 = x1.mean(axis=0), x2.mean(axis=0)
+    squares = np.mean((x1 - origin1) ** 2) + np.mean((x2 - origin2) ** 2)
+    return Conditioning(origin1, origin2, float(np.sqrt(squares / 2.0)) / RMS)
+
+
+def displaced(conditioning: Conditioning, F: Array) -> Conditioning:
+    """Move the second origin off the centroid, across the epipolar lines.
+
+    Centring makes the two singular values of a near-affine F equal, which is where the orthonormal
+    representation loses a dimension (B&S section 4.3). B&S section 3.2 advises to translate the
+    origin off the image centre; half the RMS of the coordinates is enough.
+
+    Parameters
+    ----------
+    conditioning : Conditioning
+        Centred coordinates.
+    F : ndarray, shape (3, 3)
+        An estimate in these coordinates.
+
+    Returns
+    -------
+    Conditioning
+        The same scale and first origin, another second origin.
+    """
+    normal = F[:2, 2]
+    length = float(np.linalg.norm(normal))
+    direction = normal / length if length > 0.0 else np.array([1.0, 0.0])
+    if direction[np.argmax(np.abs(direction))] < 0.0:  # the sign of F must not matter
+        direction = -direction
+    origin2 = conditioning.origin2 - conditioning.scale * OFFSET * direction
+    return Conditioning(conditioning.origin1, origin2, conditioning.scale)

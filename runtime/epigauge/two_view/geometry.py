@@ -1,0 +1,198 @@
+"""Cameras, points and distances that follow from a fundamental matrix."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge import kernels
+from epigauge._arguments import as_fundamental, as_matches
+from epigauge.errors import ArgumentError
+from epigauge.two_view.conditioning import Conditioning, condition
+from epigauge.two_view.eliminated import foot_points
+from epigauge.two_view.parameterizations import factorize
+
+__all__ = ["canonical_cameras", "reprojection_distances", "sampson_distances", "triangulate"]
+
+Array = NDArray[np.float64]
+
+
+def canonical_cameras(F: ArrayLike) -> tuple[Array, Array]:
+    """Return the canonic realisation P = (I | 0), P' = (u2 v1^T - sigma u1 v2^T | u3).
+
+    Parameters
+    ----------
+    F : array_like, shape (3, 3)
+        Fundamental matrix; of rank 3, the nearest matrix of rank 2 is taken.
+
+    Returns
+    -------
+    P1, P2 : ndarray, shape (3, 4)
+        Cameras whose fundamental matrix is F up to scale.
+
+    Raises
+    ------
+    ArgumentError
+        If F is not a finite (3, 3) matrix of rank 2 at least.
+
+    References
+    ----------
+    .. [BS04] A. Bartoli, P. Sturm, "Nonlinear estimation of the fundamental matrix with minimal
+       parameters", PAMI 26(3), 2004, eqs. (4), (5).
+    """
+    factors = factorize(_rank_two("F", F))
+    return np.eye(3, 4), np.asarray(kernels.table().canonical_camera(*factors))
+
+
+def reprojection_distances(
+    F: ArrayLike, x1: ArrayLike, x2: ArrayLike
+) -> tuple[Array, Array, Array]:
+    """Return the exact reprojection error of each match and the corrected matches.
+
+    d^2 is the smallest sum of squared shifts, in both images, that makes a match satisfy the
+    epipolar geometry: the error of optimal triangulation.
+
+    Parameters
+    ----------
+    F : array_like, shape (3, 3)
+        Fundamental matrix with ``x2^T F x1 = 0``; of rank 3, the nearest of rank 2 is taken.
+    x1, x2 : array_like, shape (m, 2)
+        Matches in pixels.
+
+    Returns
+    -------
+    d : ndarray, shape (m,)
+        Signed distances in pixels; the sign is that of ``x2^T F x1``.
+    x1_hat, x2_hat : ndarray, shape (m, 2)
+        Corrected matches in pixels: ``x2_hat^T F x1_hat = 0``.
+
+    Raises
+    ------
+    ArgumentError
+        On bad shapes, NaN or infinity, or an F without a rank of 2.
+
+    Notes
+    -----
+    The minimum is global: in suitable coordinates it is the root of one monotone scalar equation.
+    Hartley and Sturm find it as a root of a polynomial of degree 6.
+
+    References
+    ----------
+    .. [1] R. Hartley, P. Sturm, "Triangulation", CVIU 68(2), 1997.
+    """
+    x1, x2 = as_matches(x1, x2, at_least=0)
+    F = _rank_two("F", F)
+    if not len(x1):
+        return np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2))
+    frame, F_inside, q1, q2 = _conditioned(F, x1, x2)
+    table = kernels.table()
+    feet = foot_points(table, F_inside, q1, q2)
+    q1_hat, q2_hat, _ = table.foot_point_derivative(*feet.frame, q1, q2, feet.multiplier)
+    return (feet.d * frame.scale, *frame.backward(q1_hat, q2_hat))
+
+
+def sampson_distances(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> Array:
+    """Return the gradient-weighted (Sampson) distance of each match, C / |dC/d(x1, x2)|.
+
+    Parameters
+    ----------
+    F : array_like, shape (3, 3)
+        Fundamental matrix with ``x2^T F x1 = 0``.
+    x1, x2 : array_like, shape (m, 2)
+        Matches in pixels.
+
+    Returns
+    -------
+    ndarray, shape (m,)
+        Signed distances in pixels: the exact ones to first order in the noise. A match that lies
+        on both epipoles has distance zero.
+
+    Raises
+    ------
+    ArgumentError
+        On bad shapes, NaN or infinity, or an F without a rank of 2.
+    """
+    x1, x2 = as_matches(x1, x2, at_least=0)
+    F = _rank_two("F", F)
+    if not len(x1):
+        return np.zeros(0)
+    frame, F_inside, q1, q2 = _conditioned(F, x1, x2)
+    with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0 on both epipoles
+        r, _ = kernels.table().sampson(F_inside, q1, q2)
+    return np.nan_to_num(r[0], nan=0.0, posinf=0.0, neginf=0.0) * frame.scale
+
+
+def triangulate(P: ArrayLike, x: ArrayLike) -> Array:
+    """Return the points whose projections are nearest to the matches (maximum likelihood).
+
+    Parameters
+    ----------
+    P : array_like, shape (2, 3, 4)
+        Two cameras with different centres.
+    x : array_like, shape (2, m, 2)
+        Matches in pixels, ``x[0]`` in the first image.
+
+    Returns
+    -------
+    ndarray, shape (m, 4)
+        Homogeneous points of unit norm; the last coordinate is not negative. Points at infinity
+        are legal. Of a match on both epipoles only the line through the camera centres is known:
+        one point of it is returned.
+
+    Raises
+    ------
+    ArgumentError
+        On bad shapes, NaN or infinity, or cameras with the same centre.
+
+    Notes
+    -----
+    The matches are corrected to their foot points, whose rays meet exactly.
+    """
+    cameras = np.asarray(P, dtype=np.float64)
+    if cameras.shape != (2, 3, 4) or not np.isfinite(cameras).all():
+        raise ArgumentError("P", f"has shape {cameras.shape}", "two finite cameras, (2, 3, 4)")
+    points = np.asarray(x)
+    if points.ndim != 3 or points.shape[0] != 2:
+        raise ArgumentError("x", f"has shape {points.shape}", "the two images' points, (2, m, 2)")
+    _, x1_hat, x2_hat = reprojection_distances(_fundamental(cameras), points[0], points[1])
+    # Each row of x cross P X = 0 is scaled to unit norm, so that neither image dominates.
+    rows = []
+    for camera, hat in zip(cameras, (x1_hat, x2_hat), strict=True):
+        for axis in (0, 1):
+            row = hat[:, axis, None] * camera[2] - camera[axis]
+            norms = np.linalg.norm(row, axis=1, keepdims=True)
+            rows.append(row / np.where(norms > 0.0, norms, 1.0))
+    Q = np.linalg.svd(np.stack(rows, axis=1))[2][:, -1]
+    return np.asarray(np.where(Q[:, 3:] < 0.0, -Q, Q))
+
+
+def _fundamental(P: Array) -> Array:
+    """Return F of two cameras: entry (i, j) is the determinant without rows i and j."""
+    others = ([1, 2], [2, 0], [0, 1])
+    P = P / np.linalg.norm(P, axis=(1, 2), keepdims=True)
+    F = np.array(
+        [
+            [np.linalg.det(np.vstack([P[0][others[j]], P[1][others[i]]])) for j in range(3)]
+            for i in range(3)
+        ]
+    )
+    values = np.linalg.svd(F, compute_uv=False)
+    if values[1] <= 1e-13:
+        raise ArgumentError("P", "has two cameras with the same centre", "cameras that moved")
+    return F
+
+
+def _rank_two(name: str, F: ArrayLike) -> Array:
+    """Check F and lower its rank to 2."""
+    U, values, Vt = np.linalg.svd(as_fundamental(F, name))
+    if values[1] <= np.finfo(float).eps * values[0]:
+        raise ArgumentError(name, "has rank 1", "a fundamental matrix, of rank 2")
+    return np.asarray((U[:, :2] * (values[:2] / values[0])) @ Vt[:2])
+
+
+def _conditioned(F: Array, x1: Array, x2: Array) -> tuple[Conditioning, Array, Array, Array]:
+    """Return conditioning, F and matches in conditioned coordinates."""
+    frame = condition(x1, x2)
+    if frame.scale == 0.0:  # a single match, or all equal
+        frame = Conditioning(frame.origin1, frame.origin2, 1.0)
+    return frame, frame.from_pixels(F), *frame.forward(x1, x2)
