@@ -129,14 +129,32 @@ def jacobian(values: Sequence[sp.Expr], variables: Sequence[sp.Symbol]) -> sp.Ma
     return sp.Matrix([[sp.diff(value, variable) for variable in variables] for value in values])
 
 
+def derivatives_at(
+    values: Sequence[sp.Expr], variables: Sequence[sp.Symbol], point: Mapping[sp.Symbol, sp.Expr]
+) -> tuple[sp.Matrix, sp.Array]:
+    """Return first derivatives (values, variables) and second ones (values, variables, variables).
+
+    Both evaluated at a point.
+    """
+    size = len(variables)
+    first = [[sp.diff(value, variable) for variable in variables] for value in values]
+    second = [[[sp.S.Zero] * size for _ in variables] for _ in values]
+    for k, row in enumerate(first):
+        for i, derivative in enumerate(row):
+            for j in range(i, size):
+                second[k][i][j] = at(sp.diff(derivative, variables[j]), point)
+                second[k][j][i] = second[k][i][j]
+    return at(sp.Matrix(first), point), sp.Array(second)
+
+
 def upper(matrix: sp.Matrix) -> list[sp.Expr]:
     """Pack a symmetric matrix: its upper triangle, row by row."""
     return [matrix[i, j] for i in range(matrix.rows) for j in range(i, matrix.cols)]
 
 
 def at(expression: sp.Expr, point: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
-    """Evaluate an expression at a point, all symbols replaced at once."""
-    return expression.subs(point, simultaneous=True)
+    """Evaluate an expression or a matrix at a point, all symbols replaced at once."""
+    return expression.xreplace({symbol: sp.sympify(value) for symbol, value in point.items()})
 
 
 def kernels() -> Iterator[Kernel]:

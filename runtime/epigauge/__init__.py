@@ -5,9 +5,11 @@
 >>> result.F, result.rms_px, result.covariance  # doctest: +SKIP
 """
 
-from epigauge import kernels
+from epigauge import casadi, kernels
 from epigauge.errors import ArgumentError, BackendError, EpigaugeError, FileFormatError
+from epigauge.io import Matches, load_matches, save_matches, save_result
 from epigauge.kernels import backend, set_backend
+from epigauge.scenes import TwoViewScene, two_view_scene
 from epigauge.two_view.geometry import (
     canonical_cameras,
     reprojection_distances,
@@ -26,13 +28,20 @@ __all__ = [
     "EpigaugeError",
     "FileFormatError",
     "FundamentalResult",
+    "Matches",
+    "TwoViewScene",
     "backend",
     "canonical_cameras",
+    "casadi",
     "fundamental_8point",
     "kernels",
+    "load_matches",
     "refine_fundamental",
     "reprojection_distances",
     "sampson_distances",
+    "save_matches",
+    "save_result",
     "set_backend",
     "triangulate",
+    "two_view_scene",
 ]

@@ -8,7 +8,13 @@ from __future__ import annotations
 
 import os
 
-__all__ = ["ArgumentError", "BackendError", "EpigaugeError", "FileFormatError"]
+__all__ = [
+    "ArgumentError",
+    "BackendError",
+    "EpigaugeError",
+    "FileFormatError",
+    "MissingPackageError",
+]
 
 
 class EpigaugeError(ValueError):
@@ -83,3 +89,23 @@ class BackendError(EpigaugeError):
 
     def __str__(self) -> str:
         return f"backend {self.name!r} {self.reason}; {self.remedy}"
+
+
+class MissingPackageError(EpigaugeError, ImportError):
+    """A function needs an optional package that is not installed.
+
+    Parameters
+    ----------
+    package : str
+        Name of the package.
+    extra : str
+        The extra of epigauge that brings it.
+    """
+
+    def __init__(self, package: str, extra: str) -> None:
+        super().__init__(package, extra)
+        self.package = package
+        self.extra = extra
+
+    def __str__(self) -> str:
+        return f"needs the package {self.package}: pip install 'epigauge[{self.extra}]'"

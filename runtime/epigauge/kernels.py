@@ -252,6 +252,5 @@ def _library() -> ctypes.CDLL:
             raise BackendError(
                 "c", "was built from other formulas", "install epigauge again to rebuild it"
             )
-    raise BackendError(
-        "c", "was not built when epigauge was installed", "install a C compiler, then epigauge again"
-    )
+    remedy = "install a C compiler, then epigauge again"
+    raise BackendError("c", "was not built when epigauge was installed", remedy)

@@ -60,7 +60,8 @@ def emit(programs: list[Program]) -> dict[str, str]:
     """Write one source file a family, their common header, and the digest of them all."""
     files = {}
     for family, members in families(programs).items():
-        text = file_header(family, "/* {} */") + '#include "epigauge_kernels.h"\n\n#include <math.h>\n'
+        text = file_header(family, "/* {} */")
+        text += '#include "epigauge_kernels.h"\n\n#include <math.h>\n'
         text += "".join(_function(program) for program in members)
         files[f"c/{family}.c"] = text
     prototypes = "".join(f"{_prototype(program.kernel)};\n\n" for program in programs)

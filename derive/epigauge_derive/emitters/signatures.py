@@ -1,4 +1,4 @@
-"""The table of kernels that the runtime reads: arguments, shapes and the digest of the C sources."""
+"""The table of kernels that the runtime reads: arguments, shapes, digest of the C sources."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sympy as sp
 
-from epigauge_derive.kernel import Input, Kernel, Output, at, jacobian
+from epigauge_derive.kernel import Input, Kernel, Output, derivatives_at
 from epigauge_derive.models.rotations import euler_rotation
 
 U, V, SIGMA = Input("U", (3, 3)), Input("V", (3, 3)), Input("sigma")
@@ -38,17 +38,10 @@ def updated() -> tuple[sp.Matrix, sp.Matrix, sp.Expr]:
     )
 
 
-def derivatives_at_zero(values: sp.Matrix) -> sp.Matrix:
-    """Differentiate by the seven update parameters, at no update."""
+def update_derivatives(values: sp.Matrix) -> tuple[sp.Matrix, sp.Array]:
+    """Differentiate once and twice by the seven update parameters, at no update."""
     delta = DELTA.entries()
-    return at(jacobian(list(values), delta), dict.fromkeys(delta, 0))
-
-
-def second_derivatives_at_zero(values: sp.Matrix) -> list[list[list[sp.Expr]]]:
-    """Differentiate twice by the seven update parameters, at no update."""
-    delta = DELTA.entries()
-    still = dict.fromkeys(delta, 0)
-    return [[[at(sp.diff(e, a, b), still) for b in delta] for a in delta] for e in values]
+    return derivatives_at(list(values), delta, dict.fromkeys(delta, 0))
 
 
 def kernels() -> list[Kernel]:
@@ -56,6 +49,8 @@ def kernels() -> list[Kernel]:
     plain = (U.matrix(), V.matrix(), SIGMA.symbol())
     F, camera = fundamental(*updated()), canonical_camera(*updated())
     u_new, v_new, sigma_new = updated()
+    dF, d2F = update_derivatives(F)
+    A_perp, _ = update_derivatives(camera)
     return [
         Kernel(
             "fundamental_from_factors",
@@ -70,8 +65,8 @@ def kernels() -> list[Kernel]:
             FACTORS,
             (
                 Output.of("F", fundamental(*plain)),
-                Output.of("dF", derivatives_at_zero(F)),
-                Output.of("d2F", second_derivatives_at_zero(F)),
+                Output.of("dF", dF),
+                Output.of("d2F", d2F),
             ),
         ),
         Kernel(
@@ -87,7 +82,7 @@ def kernels() -> list[Kernel]:
             FACTORS,
             (
                 Output.of("P2", canonical_camera(*plain)),
-                Output.of("A_perp", derivatives_at_zero(camera)),
+                Output.of("A_perp", A_perp),
             ),
         ),
         Kernel(

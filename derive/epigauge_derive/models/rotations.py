@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import sympy as sp
 
-from epigauge_derive.kernel import Input, Kernel, Output, at
+from epigauge_derive.kernel import Input, Kernel, Output, derivatives_at
 
 
 def euler_rotation(theta: Sequence[sp.Expr]) -> sp.Matrix:
@@ -23,12 +23,7 @@ def kernels() -> list[Kernel]:
     theta, U = Input("theta", (3,)), Input("U", (3, 3))
     angles = theta.entries()
     moved = U.matrix() * euler_rotation(angles)
-    still = dict.fromkeys(angles, 0)
-    first = [[[at(sp.diff(e, a), still) for a in angles] for e in row] for row in moved.tolist()]
-    second = [
-        [[[at(sp.diff(e, a, b), still) for b in angles] for a in angles] for e in row]
-        for row in moved.tolist()
-    ]
+    first, second = derivatives_at(list(moved), angles, dict.fromkeys(angles, 0))
     return [
         Kernel(
             "rotation",
@@ -46,6 +41,9 @@ def kernels() -> list[Kernel]:
             "rotation_derivatives",
             "first and second derivatives of U R(theta) at theta = 0 (from B&S eqs. 1, 3).",
             (U,),
-            (Output.of("dU", first), Output.of("d2U", second)),
+            (
+                Output.of("dU", first, shape=(3, 3, 3)),
+                Output.of("d2U", second, shape=(3, 3, 3, 3)),
+            ),
         ),
     ]

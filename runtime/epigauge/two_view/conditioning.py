@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 #: Root mean square of a conditioned coordinate; `benchmarks/evaluations.py` compares others.
 RMS = 2.0
 
-#: How far the second origin is moved off the centroid, in conditioned units (half the RMS).
-OFFSET = 1.0
+#: How far the second origin is moved off the centroid, in conditioned units (a quarter of the RMS).
+OFFSET = 0.5
 
 
 @dataclass(frozen=True)
@@ -60,11 +60,13 @@ class Conditioning:
 
     def entry_map(self) -> Array:
         """Return the (9, 9) matrix from vect(F) conditioned to vect(F) for pixels."""
-        return np.kron(self._to_units(self.origin2).T, self._to_units(self.origin1).T)
+        product = np.kron(self._to_units(self.origin2).T, self._to_units(self.origin1).T)
+        return np.asarray(product, dtype=np.float64)
 
     def _to_units(self, origin: Array) -> Array:
         x, y = origin
-        return np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, self.scale]]) / self.scale
+        pixels = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, self.scale]])
+        return np.asarray(pixels / self.scale)
 
     def _pixels_from(self, origin: Array) -> Array:
         x, y = origin
@@ -94,7 +96,7 @@ def displaced(conditioning: Conditioning, F: Array) -> Conditioning:
 
     Centring makes the two singular values of a near-affine F equal, which is where the orthonormal
     representation loses a dimension (B&S section 4.3). B&S section 3.2 advises to translate the
-    origin off the image centre; half the RMS of the coordinates is enough.
+    origin off the image centre; a quarter of the RMS of the coordinates is enough.
 
     Parameters
     ----------

@@ -119,7 +119,8 @@ def sampson_distances(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> Array:
     frame, F_inside, q1, q2 = _conditioned(F, x1, x2)
     with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0 on both epipoles
         r, _ = kernels.table().sampson(F_inside, q1, q2)
-    return np.nan_to_num(r[0], nan=0.0, posinf=0.0, neginf=0.0) * frame.scale
+    finite = np.nan_to_num(r[0], nan=0.0, posinf=0.0, neginf=0.0)
+    return np.asarray(finite * frame.scale)
 
 
 def triangulate(P: ArrayLike, x: ArrayLike) -> Array:

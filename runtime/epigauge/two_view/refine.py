@@ -32,7 +32,7 @@ __all__ = ["refine_fundamental"]
 
 Array = NDArray[np.float64]
 
-_DAMPINGS = {"levenberg": Levenberg, "seber": Seber}
+_DAMPINGS: dict[str, type[Levenberg] | type[Seber]] = {"levenberg": Levenberg, "seber": Seber}
 _STRUCTURES = ("eliminated", "joint")
 _HESSIANS = ("exact", "gauss-newton")
 _CRITERIA = ("reprojection",)

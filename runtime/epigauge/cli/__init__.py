@@ -1,0 +1,49 @@
+"""Commands for files of matches: human text on stderr, data on stdout.
+
+Exit codes: 0 done, 1 did not converge, 2 bad input. One module a command; a command is a function
+that returns its exit code, registered here.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+import epigauge as eg
+from epigauge.cli._common import command
+from epigauge.cli.demo import demo
+from epigauge.cli.info import info
+from epigauge.cli.refine import refine
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"epigauge {eg.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Geometry of uncalibrated images: the maximum-likelihood fundamental matrix.
+
+    Text for people goes to stderr, data to stdout.
+    Exit codes: 0 done, 1 did not converge, 2 bad input.
+    """
+
+
+for _function in (demo, refine, info):
+    app.command()(command(_function))

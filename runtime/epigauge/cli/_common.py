@@ -1,0 +1,79 @@
+"""What the commands share: where text and data go, and how a failure ends."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, ParamSpec
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from epigauge.errors import EpigaugeError
+from epigauge.io import plain
+
+P = ParamSpec("P")
+
+DONE, NOT_CONVERGED, BAD_INPUT = 0, 1, 2
+
+Json = Annotated[bool, typer.Option("--json", help="Write one JSON document to stdout.")]
+
+
+def command(function: Callable[P, int]) -> Callable[P, None]:
+    """Make a command of a function that returns its exit code.
+
+    Errors of epigauge and of the operating system end it with `BAD_INPUT` and one line on stderr;
+    anything else is a bug and keeps its traceback.
+    """
+
+    @functools.wraps(function)
+    def run(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            code = function(*args, **kwargs)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            # The reader of stdout has seen enough; let the interpreter not complain at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(DONE) from None
+        except (EpigaugeError, OSError) as error:
+            typer.echo(f"epigauge: {_one_line(error)}", err=True)
+            raise typer.Exit(BAD_INPUT) from None
+        raise typer.Exit(code)
+
+    return run
+
+
+def console() -> Console:
+    """Return the console for people: on stderr, as it is at this moment."""
+    return Console(stderr=True, highlight=False)
+
+
+def write_json(document: dict[str, Any]) -> None:
+    """Write one JSON document to stdout."""
+    typer.echo(json.dumps(plain(document), indent=1, allow_nan=False))
+
+
+def facts(title: str, rows: dict[str, str]) -> Table:
+    """Return a table of names and what is known about them."""
+    table = Table(title=title, title_justify="left", show_header=False)
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    for name, value in rows.items():
+        table.add_row(name, value)
+    return table
+
+
+def shown(path: Path) -> str:
+    """Return a path as the caller wrote it, without what a terminal would interpret."""
+    return "".join(c if c.isprintable() else "?" for c in str(path))
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{os.fspath(error.filename)}: {error.strerror}"
+    return " ".join(str(error).split())

@@ -1,0 +1,179 @@
+"""``epigauge refine``: from a file of matches to the fundamental matrix."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.markup import escape
+from rich.table import Table
+
+import epigauge as eg
+from epigauge.cli._common import DONE, NOT_CONVERGED, Json, console, facts, shown, write_json
+from epigauge.errors import ArgumentError, FileFormatError
+from epigauge.io import Matches, load_matches, plain, save_result
+from epigauge.io._common import check_suffix
+
+Array = NDArray[np.float64]
+
+#: Arguments of `refine_fundamental` that come from the file.
+_FROM_FILE = ("x1", "x2", "x1, x2", "weights")
+
+
+def refine(
+    matches: Annotated[
+        Path, typer.Argument(help="CSV, TXT or NPZ: x1, y1, x2, y2 in pixels.", show_default=False)
+    ],
+    parameterization: Annotated[str, typer.Option(help="How F is represented.")] = "ortho",
+    criterion: Annotated[str, typer.Option(help="What is minimised.")] = "reprojection",
+    structure: Annotated[str, typer.Option(help="eliminated or joint.")] = "eliminated",
+    hessian: Annotated[str, typer.Option(help="exact or gauss-newton.")] = "exact",
+    noise_px: Annotated[
+        float | None,
+        typer.Option(
+            help="Standard deviation of a coordinate, for the covariance; "
+            "estimated from the residuals when not given."
+        ),
+    ] = None,
+    max_iter: Annotated[int, typer.Option(help="Trial steps allowed.")] = 100,
+    backend: Annotated[
+        str | None, typer.Option(help="c, numpy or casadi; see `epigauge info`.")
+    ] = None,
+    inliers: Annotated[
+        bool, typer.Option("--inliers", help="Use only the matches the file marks as inliers.")
+    ] = False,
+    plot: Annotated[Path | None, typer.Option(help="Draw a picture: PNG or SVG.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Save the whole result: NPZ or JSON.")
+    ] = None,
+    json: Json = False,
+) -> int:
+    """Refine the fundamental matrix of a file of matches.
+
+    Starts from the 8-point estimate and minimises the reprojection error.
+    Writes F with x2^T F x1 = 0 to stdout, three lines of three numbers; with
+    --json everything known about it but the derivatives.
+    """
+    if plot is not None:
+        check_suffix(plot, ".png", ".svg")
+    if output is not None:
+        check_suffix(output, ".npz", ".json")
+    pair = load_matches(matches, inliers=inliers)
+    begin = time.perf_counter()
+    try:
+        result = eg.refine_fundamental(
+            pair.x1,
+            pair.x2,
+            parameterization=parameterization,
+            criterion=criterion,
+            structure=structure,
+            hessian=hessian,
+            noise_px=noise_px,
+            weights=pair.weights,
+            max_iter=max_iter,
+            backend=backend,
+        )
+    except ArgumentError as error:
+        if error.argument in _FROM_FILE:
+            raise FileFormatError(matches, str(error)) from None
+        raise
+    seconds = time.perf_counter() - begin
+
+    std_F, std_sigma = standard_deviations(result.F, result.covariance)
+    more = {
+        "file": str(matches),
+        "matches": len(pair),
+        "std_F": std_F,
+        "std_sigma": std_sigma,
+        "epipoles": epipoles(result.F),
+        "noise_estimated": noise_px is None,
+        "seconds": seconds,
+    }
+    if output is not None:
+        save_result(output, result, **more)
+    if plot is not None:
+        _draw(plot, result, pair)
+    if json:
+        everything = plain(result)
+        del everything["jac"]
+        write_json(everything | more)
+    else:
+        _report(result, more)
+        for row in result.F:
+            typer.echo(" ".join(f"{value: 24.17g}" for value in row))
+    return DONE if result.success else NOT_CONVERGED
+
+
+def standard_deviations(F: Array, covariance: Array) -> tuple[Array, float]:
+    """Return the standard deviations of the entries of F and of its ratio sigma.
+
+    Parameters
+    ----------
+    F : ndarray, shape (3, 3)
+        Fundamental matrix.
+    covariance : ndarray, shape (9, 9)
+        Covariance of vect(F), row-wise.
+
+    Returns
+    -------
+    std_F : ndarray, shape (3, 3)
+        Square roots of the diagonal.
+    std_sigma : float
+        To first order, from d sigma = (u2^T dF v2 - sigma u1^T dF v1) / s1; infinite where the
+        covariance is.
+    """
+    U, s, Vt = np.linalg.svd(F)
+    by_F = (np.outer(U[:, 1], Vt[1]) - s[1] / s[0] * np.outer(U[:, 0], Vt[0])).ravel() / s[0]
+    std_F = np.sqrt(np.diag(covariance)).reshape(3, 3)
+    if not np.isfinite(covariance).all():
+        return std_F, float("inf")
+    return std_F, float(np.sqrt(max(by_F @ covariance @ by_F, 0.0)))
+
+
+def epipoles(F: Array) -> list[list[float]]:
+    """Return the epipoles in image 1 and 2, in pixels; not finite where they lie at infinity."""
+    U, _, Vt = np.linalg.svd(F)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return [(e[:2] / e[2]).tolist() for e in (Vt[2], U[:, 2])]
+
+
+def _draw(path: Path, result: eg.FundamentalResult, pair: Matches) -> None:
+    """Write the picture."""
+    from epigauge.plots import plot_refinement, save_figure
+
+    sizes = (pair.image_size1, pair.image_size2)
+    save_figure(plot_refinement(result, pair.x1, pair.x2, image_sizes=sizes), path)
+
+
+def _report(result: eg.FundamentalResult, more: dict[str, Any]) -> None:
+    """Tell people on stderr what came out."""
+    origin = "estimated from the residuals" if more["noise_estimated"] else "given"
+    e1, e2 = (_place(e) for e in more["epipoles"])
+    rows = {
+        "matches": str(more["matches"]),
+        "rms_px": f"{result.rms_px:.6g} per coordinate",
+        "noise_px": f"{result.noise_px:.6g}, {origin}",
+        "sigma": f"{result.sigma:.8g}, standard deviation {more['std_sigma']:.2g}",
+        "epipoles": f"{e1} in image 1, {e2} in image 2",
+        "evaluations": f"{result.nfev}, with {result.njev} linearisations",
+        "status": escape(result.message),
+        "seconds": f"{more['seconds']:.4f}",
+    }
+    if result.rank < 7:
+        rows["warning"] = f"the matches determine only {result.rank} of the 7 directions of F"
+    out = console()
+    out.print(facts(escape(shown(Path(more["file"]))), rows))
+    deviations = Table(title="standard deviation of F", show_header=False, title_justify="left")
+    for row in more["std_F"]:
+        deviations.add_row(*(f"{value:.2e}" for value in row))
+    out.print(deviations)
+    if not result.success:
+        out.print(f"[bold red]did not converge:[/] {escape(result.message)}")
+
+
+def _place(e: list[float]) -> str:
+    return f"({e[0]:.6g}, {e[1]:.6g})" if np.isfinite(e).all() else "at infinity"

@@ -1,0 +1,153 @@
+"""Matches in NPZ files, read without unpickling and with sizes checked before allocating."""
+
+from __future__ import annotations
+
+import lzma
+import math
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.errors import FileFormatError
+from epigauge.io._common import MAX_MATCHES, cut, listed
+
+_MAX_VALUES = 4 * MAX_MATCHES
+_MAX_HEADER = 1000
+_DESCR = re.compile(r"'descr': *'([^']{1,8})'")
+_ORDER = re.compile(r"'fortran_order': *(True|False)")
+_SHAPE = re.compile(r"'shape': *\(([0-9, ]{0,100})\)")
+
+#: What the ZIP and npy readers raise on damaged or hostile files; warnings, where the caller has
+#: made them errors.
+_DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    struct.error,
+    EOFError,
+    MemoryError,
+    NotImplementedError,
+    OSError,
+    OverflowError,
+    RecursionError,
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+    Warning,
+)
+
+
+def read_npz(path: Path, file: IO[bytes], inliers: bool) -> dict[str, Any]:
+    """Read the arrays of an NPZ file.
+
+    Parameters
+    ----------
+    path : Path
+        Name of the file for messages.
+    file : binary file
+        Its content, seekable.
+    inliers : bool
+        Read the array ``inlier`` too.
+
+    Returns
+    -------
+    dict
+        Arrays x1, x2 and, where the file has them, weights, inlier, image_size1, image_size2.
+
+    Raises
+    ------
+    FileFormatError
+        Naming the array at fault.
+    """
+    if not file.read(1):
+        raise FileFormatError(path, "is empty")
+    found: dict[str, Any] = {}
+    with _damage(path, "is not a readable NPZ (ZIP) file"), zipfile.ZipFile(file) as archive:
+        members = {name.removesuffix(".npy"): name for name in archive.namelist()}
+        wanted = ["weights", "image_size1", "image_size2"]
+        if inliers:
+            wanted.append("inlier")
+        if "x1" in members and "x2" in members:
+            wanted += ["x1", "x2"]
+        elif "matches" in members:
+            wanted.append("matches")
+        else:
+            raise FileFormatError(
+                path,
+                f"needs arrays x1 and x2, or matches; it holds {listed(list(members))}",
+            )
+        for name in wanted:
+            if name in members:
+                found[name] = _read_npy(path, archive, members[name])
+    if "matches" in found:
+        table = found.pop("matches")
+        if table.ndim != 2 or table.shape[1] != 4:
+            raise FileFormatError(path, f"matches has shape {table.shape}, needed: (m, 4)")
+        found["x1"], found["x2"] = table[:, 0:2], table[:, 2:4]
+    return found
+
+
+def _read_npy(path: Path, archive: zipfile.ZipFile, member: str) -> NDArray[Any]:
+    """Read one array, having checked its declared type and size before allocating it."""
+    name = member.removesuffix(".npy")
+    with _damage(path, f"array {name} is damaged"), archive.open(member) as stream:
+        shape, by_columns, dtype = _read_header(path, name, stream)
+        if not all(0 <= side <= MAX_MATCHES for side in shape) or math.prod(shape) > _MAX_VALUES:
+            raise FileFormatError(
+                path, f"array {name} has shape {cut(shape)}, needed: at most {MAX_MATCHES} matches"
+            )
+        size = math.prod(shape) * dtype.itemsize
+        declared = archive.getinfo(member).file_size
+        if size > declared:
+            raise FileFormatError(
+                path, f"array {name} is cut short: {size} bytes of data in a member of {declared}"
+            )
+        data = stream.read(size)
+        # Reading on to the end of the member makes zipfile check its sum.
+        if len(data) != size or stream.read(1):
+            raise FileFormatError(path, f"array {name} has not the size that its header declares")
+        values = np.frombuffer(data, dtype=dtype)
+        return values.reshape(shape, order="F" if by_columns else "C")
+
+
+def _read_header(path: Path, name: str, stream: IO[bytes]) -> tuple[tuple[int, ...], bool, Any]:
+    """Read shape, order and type of an npy array.
+
+    NumPy's own reader evaluates the header as Python source and, for files of Python 2, tokenises
+    it: more than a file of numbers needs, and on hostile input it raises whatever those raise.
+    """
+    magic = stream.read(8)
+    if magic not in (b"\x93NUMPY\x01\x00", b"\x93NUMPY\x02\x00"):
+        raise FileFormatError(path, f"array {name} is not in npy format, version 1 or 2")
+    length = int.from_bytes(stream.read(2 if magic[6] == 1 else 4), "little")
+    header = stream.read(min(length, _MAX_HEADER)).decode("ascii")
+    order, shape = _ORDER.search(header), _SHAPE.search(header)
+    if len(header) != length or order is None or shape is None:
+        raise FileFormatError(path, f"array {name} is damaged: npy header {cut(header)!r}")
+    descr = _DESCR.search(header)
+    dtype = None if descr is None else np.dtype(descr[1])
+    if dtype is None or dtype.kind not in "biuf":
+        kind = "objects" if dtype is not None and dtype.hasobject else f"type {cut(dtype)}"
+        raise FileFormatError(path, f"array {name} holds {kind}, needed: plain numbers")
+    return tuple(map(int, shape[1].replace(",", " ").split())), order[1] == "True", dtype
+
+
+@contextmanager
+def _damage(path: Path, what: str) -> Iterator[None]:
+    """Turn what the readers raise on a damaged file into one kind of error."""
+    try:
+        yield
+    except FileFormatError:
+        raise
+    except _DAMAGE as error:
+        reason = cut(str(error) or type(error).__name__, limit=100)
+        raise FileFormatError(path, f"{what}: {reason}") from error

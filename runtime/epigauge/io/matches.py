@@ -1,0 +1,170 @@
+"""Point matches of an image pair: read and written as CSV, TXT or NPZ."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge._arguments import as_matches, as_weights
+from epigauge.errors import ArgumentError, FileFormatError
+from epigauge.io._common import PathLike, check_suffix, cut
+from epigauge.io._npz import read_npz
+from epigauge.io._text import COORDINATES, read_text
+from epigauge.io.output import writing
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matches:
+    """Point matches of an image pair, as read from a file.
+
+    Parameters
+    ----------
+    x1, x2 : ndarray, shape (m, 2)
+        Matching points in image 1 and 2, in pixels.
+    weights : ndarray, shape (m,), optional
+        One weight >= 0 a match.
+    image_size1, image_size2 : (int, int), optional
+        (width, height) of the images, in pixels.
+    name : str
+        What to call the pair: the file's name without its suffix.
+    """
+
+    x1: Array
+    x2: Array
+    weights: Array | None = None
+    image_size1: tuple[int, int] | None = None
+    image_size2: tuple[int, int] | None = None
+    name: str = ""
+
+    def __len__(self) -> int:
+        return len(self.x1)
+
+
+def load_matches(path: PathLike, inliers: bool = False) -> Matches:
+    """Read point matches from a CSV, TXT or NPZ file.
+
+    Text (every suffix but ``.npz``): one match a line, columns separated by commas, semicolons or
+    white space, ``#`` starts a comment. Either four columns x1, y1, x2, y2, or a first line with
+    the names of the columns: these four in any order, optionally ``weight`` and ``inlier`` (0 or
+    1); other columns are ignored. A comment that holds nothing but these names is obeyed too.
+
+    NPZ: arrays ``x1`` and ``x2`` (m, 2), or ``matches`` (m, 4) with columns x1, y1, x2, y2;
+    optionally ``weights`` (m,), ``inlier`` (m,), ``image_size1`` and ``image_size2`` (width,
+    height). Other arrays are not looked at.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+    inliers : bool
+        Keep only the matches that the file marks as inliers.
+
+    Returns
+    -------
+    Matches
+        At least one match, all coordinates finite.
+
+    Raises
+    ------
+    FileFormatError
+        If the file does not hold matches in this form, or more than `MAX_MATCHES` of them, or no
+        inlier marks although `inliers` asks for them.
+    OSError
+        If the file cannot be read.
+    """
+    path = Path(path)
+    with path.open("rb") as file:
+        if path.suffix.lower() == ".npz":
+            fields = read_npz(path, file, inliers)
+        else:
+            fields = read_text(path, file, inliers)
+    return _matches(path, fields, inliers)
+
+
+def save_matches(path: PathLike, matches: Matches) -> None:
+    """Write point matches so that `load_matches` reads the same numbers again, to the last bit.
+
+    Parameters
+    ----------
+    path : str or path
+        The file; ``.csv``, ``.txt`` or ``.npz`` chooses the form. Image sizes are kept by NPZ only.
+    matches : Matches
+        What to write.
+
+    Raises
+    ------
+    ArgumentError
+        If the suffix is none of these, or the matches are not usable as such.
+    OSError
+        If the file cannot be written.
+    """
+    suffix = check_suffix(path, ".csv", ".txt", ".npz")
+    x1, x2 = as_matches(matches.x1, matches.x2, at_least=1)
+    columns = [*x1.T, *x2.T]
+    names = list(COORDINATES)
+    if matches.weights is not None:
+        columns.append(as_weights(matches.weights, len(x1)))
+        names.append("weight")
+    with writing(path) as file:
+        if suffix == ".npz":
+            optional = {
+                "weights": matches.weights,
+                "image_size1": matches.image_size1,
+                "image_size2": matches.image_size2,
+            }
+            given: dict[str, Any] = {k: v for k, v in optional.items() if v is not None}
+            np.savez_compressed(file, x1=x1, x2=x2, **given)
+            return
+        comma = "," if suffix == ".csv" else " "
+        head = comma.join(names) if suffix == ".csv" else "# " + comma.join(names)
+        file.write(f"{head}\n".encode())
+        for row in np.column_stack(columns).tolist():
+            file.write((comma.join(map(repr, row)) + "\n").encode())
+
+
+def _matches(path: Path, fields: dict[str, Any], inliers: bool) -> Matches:
+    """Check what a file holds and put it together."""
+    try:
+        x1, x2 = as_matches(fields["x1"], fields["x2"], at_least=1)
+        weights = as_weights(fields["weights"], len(x1)) if "weights" in fields else None
+    except ArgumentError as error:
+        raise FileFormatError(path, str(error)) from None
+    keep = _inlier_mask(path, fields, len(x1)) if inliers else slice(None)
+    return Matches(
+        np.array(x1[keep]),
+        np.array(x2[keep]),
+        None if weights is None else np.array(weights[keep]),
+        _image_size(path, "image_size1", fields),
+        _image_size(path, "image_size2", fields),
+        path.stem,
+    )
+
+
+def _inlier_mask(path: Path, fields: dict[str, Any], m: int) -> NDArray[np.bool_]:
+    """Check the inlier marks."""
+    if "inlier" not in fields:
+        raise FileFormatError(path, "marks no inliers: it has no inlier column or array")
+    marks = fields["inlier"]
+    if marks.shape != (m,) or marks.dtype.kind not in "biu" or not np.isin(marks, (0, 1)).all():
+        raise FileFormatError(
+            path, f"inlier has type {marks.dtype}, shape {marks.shape}; needed: {m} marks 0 or 1"
+        )
+    if not marks.any():
+        raise FileFormatError(path, "marks every match as an outlier")
+    return np.asarray(marks, dtype=np.bool_)
+
+
+def _image_size(path: Path, name: str, fields: dict[str, Any]) -> tuple[int, int] | None:
+    """Check the size of an image."""
+    if name not in fields:
+        return None
+    size = fields[name]
+    if size.shape != (2,) or size.dtype.kind not in "iu" or not (size > 0).all():
+        raise FileFormatError(path, f"{name} is {cut(size.tolist())}, needed: (width, height)")
+    return int(size[0]), int(size[1])
