@@ -51,7 +51,8 @@ def differences(root: Path, files: dict[str, str]) -> str:
     lines: list[str] = []
     for name in sorted(existing(root) | set(files)):
         path = root / name
-        old = path.read_bytes().decode() if path.is_file() else None
+        # A byte that is no text shows as an escape.
+        old = path.read_bytes().decode(errors="backslashreplace") if path.is_file() else None
         new = files.get(name)
         if old == new:
             continue
@@ -61,7 +62,7 @@ def differences(root: Path, files: dict[str, str]) -> str:
             f"{name} (as it stands)" if old is not None else "missing",
             f"{name} (as derived)" if new is not None else "not derived any more",
         )
-        lines += diff or [f"{name}: empty file missing or left over\n"]
+        lines += list(diff) or [f"{name}: empty file missing or left over\n"]
     return "".join(lines)
 
 

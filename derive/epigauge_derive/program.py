@@ -153,9 +153,14 @@ def _repeat(loop: Loop, start: list[sp.Expr], names: Iterator[sp.Symbol]) -> Rep
 
 def _check_names(program: Program) -> None:
     kernel = program.kernel
-    known = {entry for argument in kernel.inputs for entry in argument.entries()}
-    for statement in program.statements:
-        known |= {symbol for symbol, _ in _blocks(statement)}
+    entries = [entry for argument in kernel.inputs for entry in argument.entries()]
+    computed = {symbol for statement in program.statements for symbol, _ in _blocks(statement)}
+    taken: set[str] = set()
+    for name in [*(entry.name for entry in entries), *sorted(symbol.name for symbol in computed)]:
+        if name in taken:
+            raise ValueError(f"kernel {kernel.name}: two symbols are named {name}")
+        taken.add(name)
+    known = {*entries, *computed}
     names = {symbol.name for symbol in known}
     for output in kernel.outputs:
         if output.name in names:

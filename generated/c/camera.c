@@ -2,6 +2,7 @@
 #include "epigauge_kernels.h"
 
 #include <math.h>
+#include <string.h>
 
 /* Formula: projection of Q by P, its Jacobians by vect(P) and by Q, and the homogeneous scale
    (depth) p3^T Q (B03 section 3).

@@ -2,6 +2,7 @@
 #include "epigauge_kernels.h"
 
 #include <math.h>
+#include <string.h>
 
 /* Formula: e truncated at order n = 0..8, e = sum (-1)^(n+1) (1 + n/2) K(n) with K(n) = g^T
    (W^-1 N)^n W^-1 g (B03 eq. 10).

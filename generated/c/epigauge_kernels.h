@@ -23,6 +23,33 @@
 /* Digest of the sources: the same as C_DIGEST in epigauge_generated/signatures.py. */
 EG_EXPORT const char *eg_digest(void);
 
+EG_EXPORT void eg_block_derivatives(
+    ptrdiff_t n,
+    const double *EG_RESTRICT U,
+    const double *EG_RESTRICT V,
+    const double *EG_RESTRICT M,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F);
+
+EG_EXPORT void eg_block_camera_derivatives(
+    ptrdiff_t n,
+    const double *EG_RESTRICT U,
+    const double *EG_RESTRICT V,
+    const double *EG_RESTRICT M,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_block_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT U,
+    const double *EG_RESTRICT V,
+    const double *EG_RESTRICT M,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT U_new,
+    double *EG_RESTRICT V_new,
+    double *EG_RESTRICT M_new);
+
 EG_EXPORT void eg_project(
     ptrdiff_t n,
     const double *EG_RESTRICT P,
@@ -50,13 +77,32 @@ EG_EXPORT void eg_algebraic(
     double *EG_RESTRICT r,
     double *EG_RESTRICT dr_dF);
 
-EG_EXPORT void eg_epipolar_distances(
+EG_EXPORT void eg_epipolar(
     ptrdiff_t n,
     const double *EG_RESTRICT F,
     const double *EG_RESTRICT q1,
     const double *EG_RESTRICT q2,
     double *EG_RESTRICT r,
     double *EG_RESTRICT dr_dF);
+
+EG_EXPORT void eg_epipolar_gauss_newton(
+    ptrdiff_t n,
+    const double *EG_RESTRICT F,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT g,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_epipolar_newton(
+    ptrdiff_t n,
+    const double *EG_RESTRICT F,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT weight_array,
+    const double *EG_RESTRICT curvature_array,
+    double *EG_RESTRICT g,
+    double *EG_RESTRICT H);
 
 EG_EXPORT void eg_sampson(
     ptrdiff_t n,
@@ -66,10 +112,353 @@ EG_EXPORT void eg_sampson(
     double *EG_RESTRICT r,
     double *EG_RESTRICT dr_dF);
 
+EG_EXPORT void eg_sampson_gauss_newton(
+    ptrdiff_t n,
+    const double *EG_RESTRICT F,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT g,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_sampson_newton(
+    ptrdiff_t n,
+    const double *EG_RESTRICT F,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT weight_array,
+    const double *EG_RESTRICT curvature_array,
+    double *EG_RESTRICT g,
+    double *EG_RESTRICT H);
+
 EG_EXPORT void eg_error_series(
     ptrdiff_t n,
     const double *EG_RESTRICT K,
     double *EG_RESTRICT e);
+
+EG_EXPORT void eg_maps_000(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_001(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_002(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_003(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_010(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_011(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_012(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_013(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_020(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_021(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_022(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_023(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_100(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_101(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_102(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_103(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_110(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_111(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_112(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_113(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_120(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_121(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_122(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_123(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_200(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_201(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_202(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_203(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_210(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_211(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_212(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_213(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_220(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_221(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_222(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_maps_223(
+    ptrdiff_t n,
+    const double *EG_RESTRICT parameters,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
 
 EG_EXPORT void eg_fundamental_from_factors(
     ptrdiff_t n,

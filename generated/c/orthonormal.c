@@ -2,6 +2,7 @@
 #include "epigauge_kernels.h"
 
 #include <math.h>
+#include <string.h>
 
 /* Formula: F = u1 v1^T + sigma u2 v2^T (B&S eq. 2).
    Inputs:  U (3, 3), V (3, 3), sigma ()

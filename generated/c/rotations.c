@@ -2,6 +2,7 @@
 #include "epigauge_kernels.h"
 
 #include <math.h>
+#include <string.h>
 
 /* Formula: R(theta) = Rx Ry Rz from Euler angles (B&S eq. 1).
    Inputs:  theta (3,)
@@ -102,6 +103,7 @@ EG_EXPORT void eg_rotation_derivatives(
     double *EG_RESTRICT dU,
     double *EG_RESTRICT d2U)
 {
+    memset(d2U, 0, 81 * (size_t)n * sizeof(double));
     EG_SIMD
     for (ptrdiff_t i = 0; i < n; ++i) {
         const double U00 = U[i];
@@ -149,86 +151,41 @@ EG_EXPORT void eg_rotation_derivatives(
         dU[24*n + i] = t8;
         dU[25*n + i] = U20;
         dU[26*n + i] = 0.0;
-        d2U[i] = 0.0;
         d2U[n + i] = U01;
         d2U[2*n + i] = U02;
         d2U[3*n + i] = U01;
         d2U[4*n + i] = t1;
-        d2U[5*n + i] = 0.0;
         d2U[6*n + i] = U02;
-        d2U[7*n + i] = 0.0;
         d2U[8*n + i] = t1;
         d2U[9*n + i] = t2;
-        d2U[10*n + i] = 0.0;
-        d2U[11*n + i] = 0.0;
-        d2U[12*n + i] = 0.0;
-        d2U[13*n + i] = 0.0;
         d2U[14*n + i] = U02;
-        d2U[15*n + i] = 0.0;
         d2U[16*n + i] = U02;
         d2U[17*n + i] = t2;
         d2U[18*n + i] = t0;
-        d2U[19*n + i] = 0.0;
-        d2U[20*n + i] = 0.0;
-        d2U[21*n + i] = 0.0;
         d2U[22*n + i] = t0;
-        d2U[23*n + i] = 0.0;
-        d2U[24*n + i] = 0.0;
-        d2U[25*n + i] = 0.0;
-        d2U[26*n + i] = 0.0;
-        d2U[27*n + i] = 0.0;
         d2U[28*n + i] = U11;
         d2U[29*n + i] = U12;
         d2U[30*n + i] = U11;
         d2U[31*n + i] = t4;
-        d2U[32*n + i] = 0.0;
         d2U[33*n + i] = U12;
-        d2U[34*n + i] = 0.0;
         d2U[35*n + i] = t4;
         d2U[36*n + i] = t5;
-        d2U[37*n + i] = 0.0;
-        d2U[38*n + i] = 0.0;
-        d2U[39*n + i] = 0.0;
-        d2U[40*n + i] = 0.0;
         d2U[41*n + i] = U12;
-        d2U[42*n + i] = 0.0;
         d2U[43*n + i] = U12;
         d2U[44*n + i] = t5;
         d2U[45*n + i] = t3;
-        d2U[46*n + i] = 0.0;
-        d2U[47*n + i] = 0.0;
-        d2U[48*n + i] = 0.0;
         d2U[49*n + i] = t3;
-        d2U[50*n + i] = 0.0;
-        d2U[51*n + i] = 0.0;
-        d2U[52*n + i] = 0.0;
-        d2U[53*n + i] = 0.0;
-        d2U[54*n + i] = 0.0;
         d2U[55*n + i] = U21;
         d2U[56*n + i] = U22;
         d2U[57*n + i] = U21;
         d2U[58*n + i] = t7;
-        d2U[59*n + i] = 0.0;
         d2U[60*n + i] = U22;
-        d2U[61*n + i] = 0.0;
         d2U[62*n + i] = t7;
         d2U[63*n + i] = t8;
-        d2U[64*n + i] = 0.0;
-        d2U[65*n + i] = 0.0;
-        d2U[66*n + i] = 0.0;
-        d2U[67*n + i] = 0.0;
         d2U[68*n + i] = U22;
-        d2U[69*n + i] = 0.0;
         d2U[70*n + i] = U22;
         d2U[71*n + i] = t8;
         d2U[72*n + i] = t6;
-        d2U[73*n + i] = 0.0;
-        d2U[74*n + i] = 0.0;
-        d2U[75*n + i] = 0.0;
         d2U[76*n + i] = t6;
-        d2U[77*n + i] = 0.0;
-        d2U[78*n + i] = 0.0;
-        d2U[79*n + i] = 0.0;
-        d2U[80*n + i] = 0.0;
     }
 }

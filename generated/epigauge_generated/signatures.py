@@ -19,9 +19,27 @@ class Signature(NamedTuple):
     formula: str
 
 
-C_DIGEST = "8f9568b7358d5eac"
+C_DIGEST = "dc3a1687f9fb26e5"
 
 SIGNATURES = {
+    "block_derivatives": Signature(
+        "block",
+        (Argument("U", (3, 3), True), Argument("V", (3, 3), True), Argument("M", (2, 2), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), ),
+        "F = U12 M V12^T with first and second derivatives of vect(F) by the seven update parameters (x1, x2, y1, y2, and three of M), at no update.",
+    ),
+    "block_camera_derivatives": Signature(
+        "block",
+        (Argument("U", (3, 3), True), Argument("V", (3, 3), True), Argument("M", (2, 2), True), ),
+        (Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "canonic P' of F = U12 M V12^T and d vect(P') by the seven update parameters.",
+    ),
+    "block_retract": Signature(
+        "block",
+        (Argument("U", (3, 3), True), Argument("V", (3, 3), True), Argument("M", (2, 2), True), Argument("delta", (7,), True), ),
+        (Argument("U_new", (3, 3), True), Argument("V_new", (3, 3), True), Argument("M_new", (2, 2), True), ),
+        "U <- U R(x1, x2, 0), V <- V R(y1, y2, 0), M moved in its tangent plane.",
+    ),
     "project": Signature(
         "camera",
         (Argument("P", (3, 4), True), Argument("Q", (4,), True), ),
@@ -40,11 +58,23 @@ SIGNATURES = {
         (Argument("r", (1,), True), Argument("dr_dF", (1, 9), True), ),
         "r = q'^T F q (B&S section 4).",
     ),
-    "epipolar_distances": Signature(
+    "epipolar": Signature(
         "criteria",
         (Argument("F", (3, 3), False), Argument("q1", (2,), True), Argument("q2", (2,), True), ),
         (Argument("r", (2,), True), Argument("dr_dF", (2, 9), True), ),
         "signed distances in pixels of q to the line F^T q' and of q' to the line F q (B&S section 4, point-to-epipolar-line criterion).",
+    ),
+    "epipolar_gauss_newton": Signature(
+        "criteria",
+        (Argument("F", (3, 3), False), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("weight", (), True), ),
+        (Argument("g", (9,), False), Argument("N", (45,), False), ),
+        "gradient and Gauss-Newton matrix (upper triangle) by vect(F) of the weighted sum of squared epipolar residuals, halved.",
+    ),
+    "epipolar_newton": Signature(
+        "criteria",
+        (Argument("F", (3, 3), False), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("weight", (), True), Argument("curvature", (), True), ),
+        (Argument("g", (9,), False), Argument("H", (45,), False), ),
+        "gradient and exact Hessian (upper triangle) by vect(F) of a robust sum of squared epipolar residuals, halved.",
     ),
     "sampson": Signature(
         "criteria",
@@ -52,11 +82,239 @@ SIGNATURES = {
         (Argument("r", (1,), True), Argument("dr_dF", (1, 9), True), ),
         "r = C / |dC/d(q, q')| with C = q'^T F q, in pixels (gradient-weighted criterion, B&S section 4).",
     ),
+    "sampson_gauss_newton": Signature(
+        "criteria",
+        (Argument("F", (3, 3), False), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("weight", (), True), ),
+        (Argument("g", (9,), False), Argument("N", (45,), False), ),
+        "gradient and Gauss-Newton matrix (upper triangle) by vect(F) of the weighted sum of squared sampson residuals, halved.",
+    ),
+    "sampson_newton": Signature(
+        "criteria",
+        (Argument("F", (3, 3), False), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("weight", (), True), Argument("curvature", (), True), ),
+        (Argument("g", (9,), False), Argument("H", (45,), False), ),
+        "gradient and exact Hessian (upper triangle) by vect(F) of a robust sum of squared sampson residuals, halved.",
+    ),
     "error_series": Signature(
         "damping",
         (Argument("K", (9,), True), ),
         (Argument("e", (9,), True), ),
         "e truncated at order n = 0..8, e = sum (-1)^(n+1) (1 + n/2) K(n) with K(n) = g^T (W^-1 N)^n W^-1 g (B03 eq. 10).",
+    ),
+    "maps_000": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 0 of e and 0 of e' and entry 0 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_001": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 0 of e and 0 of e' and entry 1 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_002": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 0 of e and 0 of e' and entry 2 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_003": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 0 of e and 0 of e' and entry 3 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_010": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 0 of e and 1 of e' and entry 0 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_011": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 0 of e and 1 of e' and entry 1 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_012": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 0 of e and 1 of e' and entry 2 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_013": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 0 of e and 1 of e' and entry 3 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_020": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 0 of e and 2 of e' and entry 0 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_021": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 0 of e and 2 of e' and entry 1 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_022": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 0 of e and 2 of e' and entry 2 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_023": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 0 of e and 2 of e' and entry 3 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_100": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 1 of e and 0 of e' and entry 0 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_101": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 1 of e and 0 of e' and entry 1 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_102": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 1 of e and 0 of e' and entry 2 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_103": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 1 of e and 0 of e' and entry 3 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_110": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 1 of e and 1 of e' and entry 0 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_111": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 1 of e and 1 of e' and entry 1 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_112": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 1 of e and 1 of e' and entry 2 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_113": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 1 of e and 1 of e' and entry 3 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_120": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 1 of e and 2 of e' and entry 0 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_121": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 1 of e and 2 of e' and entry 1 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_122": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 1 of e and 2 of e' and entry 2 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_123": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 1 of e and 2 of e' and entry 3 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_200": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 2 of e and 0 of e' and entry 0 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_201": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 2 of e and 0 of e' and entry 1 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_202": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 2 of e and 0 of e' and entry 2 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_203": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 2 of e and 0 of e' and entry 3 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_210": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 2 of e and 1 of e' and entry 0 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_211": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 2 of e and 1 of e' and entry 1 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_212": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 2 of e and 1 of e' and entry 2 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_213": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 2 of e and 1 of e' and entry 3 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_220": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 2 of e and 2 of e' and entry 0 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_221": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 2 of e and 2 of e' and entry 1 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_222": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 2 of e and 2 of e' and entry 2 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
+    ),
+    "maps_223": Signature(
+        "maps",
+        (Argument("parameters", (7,), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
+        "F and P' by epipoles with entries 2 of e and 2 of e' and entry 3 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
     ),
     "fundamental_from_factors": Signature(
         "orthonormal",
@@ -122,7 +380,7 @@ SIGNATURES = {
         "reprojection",
         (Argument("R1", (2, 2), False), Argument("R2", (2, 2), False), Argument("s", (2,), False), Argument("b1", (2,), False), Argument("b2", (2,), False), Argument("f", (), False), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("l", (), True), Argument("weight", (), True), Argument("curvature", (), True), ),
         (Argument("g", (9,), False), Argument("H", (45,), False), ),
-        "gradient and exact Hessian (upper triangle) of sum weight d^2 / 2 by vect(F) of the rotated images, H = l C_FF - R^T K^-1 R, plus curvature times the rank-one term of a robust loss.",
+        "gradient and exact Hessian (upper triangle) of a robust sum of d^2 / 2 by vect(F) of the rotated images, from H = l C_FF - R^T K^-1 R for each match.",
     ),
     "rotation": Signature(
         "rotations",

@@ -12,11 +12,11 @@ def main() -> None:
     try:
         from epigauge.cli import app
     except ModuleNotFoundError as error:
-        if error.name not in _NEEDED:
+        package = (error.name or "").partition(".")[0]
+        if package not in _NEEDED:
             raise
         print(
-            f"epigauge: the command line needs the package {error.name}: "
-            "pip install 'epigauge[cli]'",
+            f"epigauge: the command line needs the package {package}: pip install 'epigauge[cli]'",
             file=sys.stderr,
         )
         sys.exit(2)

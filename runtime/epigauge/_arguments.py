@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from epigauge.errors import ArgumentError
 
 __all__ = [
+    "as_calibration",
     "as_choice",
     "as_count",
     "as_fundamental",
@@ -81,10 +82,10 @@ def as_matches(
 def check_general_position(name: str, points: Array, *, eps: float = 2.0**-52) -> None:
     """Refuse points that are all equal or all on one line.
 
-    With s1 the root mean square distance from the centroid, s2 that from the line through the
-    centroid and the point farthest from it, and r = 4 * eps * (largest coordinate) the rounding of
-    the input, the points count as equal when ``s1 <= r`` and as collinear when
-    ``s2 <= max(r, 1e-7 * s1)``. Centring comes first, so that a large offset of the coordinates
+    With s1 the root mean square distance from the first point, s2 that from the line through the
+    first point and the one farthest from it, and r = 4 * eps * (largest coordinate) the rounding
+    of the input, the points count as equal when ``s1 <= r`` and as collinear when
+    ``s2 <= max(r, 1e-7 * s1)``. Differences come first, so that a large offset of the coordinates
     does not hide the extent of the points.
 
     Parameters
@@ -109,7 +110,6 @@ def check_general_position(name: str, points: Array, *, eps: float = 2.0**-52) -
         # Dividing by a power of two is exact and keeps squares from overflowing.
         scaled = np.ldexp(points, -int(np.frexp(size)[1]))
         x, y = (scaled - scaled[0]).T
-        x, y = x - x.mean(), y - y.mean()
         squared = x * x + y * y
         far = np.argmax(squared)
         s1, rounding = np.sqrt(squared.mean()), 4.0 * eps
@@ -189,6 +189,34 @@ def as_fundamental(F0: ArrayLike, name: str = "F0") -> Array:
     if not F.any():
         raise ArgumentError(name, "is the zero matrix", "a matrix of rank 2")
     return F
+
+
+def as_calibration(name: str, K: ArrayLike) -> Array:
+    """Check a calibration matrix: real, finite, upper triangular with a positive diagonal.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument for the message.
+    K : array_like, shape (3, 3)
+        Maps coordinates on the retina to pixels.
+
+    Returns
+    -------
+    ndarray, shape (3, 3), float64
+        The matrix, scaled to ``K[2, 2] = 1``.
+
+    Raises
+    ------
+    ArgumentError
+        If it is not such a matrix.
+    """
+    matrix = as_fundamental(K, name)
+    if np.any(np.tril(matrix, -1)) or not np.all(np.diag(matrix) / matrix[2, 2] > 0.0):
+        raise ArgumentError(
+            name, "is no calibration matrix", "[[fx, s, cx], [0, fy, cy], [0, 0, 1]]"
+        )
+    return np.asarray(matrix / matrix[2, 2])
 
 
 def as_positive(name: str, value: object, *, zero: bool = False) -> float:

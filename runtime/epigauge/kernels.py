@@ -217,18 +217,17 @@ def _wrap_casadi(name: str, signature: Signature) -> Kernel:
                 array = np.moveaxis(flat, 2, 1).reshape(flat.shape[0], -1)
             columns.append(array)
         outputs = _outputs(signature, batch)
-        if count:
-            results = build()(*columns)
-            results = results if len(outputs) > 1 else (results,)
-        else:
-            results = [np.zeros(_rows_columns(argument)) for argument in signature.outputs]
+        if not count:  # a sum over no observations is zero
+            return _result([np.zeros_like(output) for output in outputs])
+        results = build()(*columns)
+        results = results if len(outputs) > 1 else (results,)
         for argument, output, result in zip(signature.outputs, outputs, results, strict=True):
             rows, width = _rows_columns(argument)
             values = np.moveaxis(np.asarray(result).reshape(rows, -1, width), 1, 2)
             if argument.batched:
                 output[...] = values.reshape(argument.shape + batch)
             else:
-                output[...] = values.sum(axis=2).reshape(argument.shape) if count else 0.0
+                output[...] = values.sum(axis=2).reshape(argument.shape)
         return _result(outputs)
 
     return call

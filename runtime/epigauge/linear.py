@@ -121,6 +121,8 @@ class Arrow:
         Gradient by the motion.
     g_points : ndarray, shape (m, k)
         Gradient by each point.
+    border : ndarray, shape (m, k, r), optional
+        B in a term B B^T over the points that couples all of them: gauge constraints.
     """
 
     U: Array
@@ -128,6 +130,7 @@ class Arrow:
     V: Array
     g_motion: Array
     g_points: Array
+    border: Array | None = None
 
     @cached_property
     def gradient(self) -> Array:
@@ -140,22 +143,33 @@ class Arrow:
         return float(max(np.max(np.diag(self.U)), np.max(points)))
 
     def solve(self, lam: float, *, scaled: bool) -> Array:
-        """Solve by the Schur complement of the points."""
-        k = self.V.shape[1]
+        """Solve by the Schur complement of the points; the border by Woodbury's identity."""
+        p, k = len(self.U), self.V.shape[1]
         if scaled:
             U = self.U + lam * np.diag(np.diag(self.U))
             V = self.V * (1.0 + lam * np.eye(k))
         else:
-            U = self.U + lam * np.eye(len(self.U))
+            U = self.U + lam * np.eye(p)
             V = self.V + lam * np.eye(k)
         inverse = np.linalg.inv(V)
         Y = self.W @ inverse
         reduced = U - np.einsum("mpk,mqk->pq", Y, self.W)
-        right = -self.g_motion + np.einsum("mpk,mk->p", Y, self.g_points)
-        motion = np.linalg.solve(reduced, right)
-        coupled = self.g_points + np.einsum("mpk,p->mk", self.W, motion)
-        points = -np.einsum("mkl,ml->mk", inverse, coupled)
-        return np.concatenate([motion, points.ravel()])
+
+        def apply(motion: Array, points: Array) -> Array:
+            """Apply the inverse to right-hand sides (p, r) and (m, k, r)."""
+            motion = np.linalg.solve(reduced, motion - np.einsum("mpk,mkr->pr", Y, points))
+            points = inverse @ (points - np.einsum("mpk,pr->mkr", self.W, motion))
+            return np.concatenate([motion, points.reshape(-1, motion.shape[1])])
+
+        step = -apply(self.g_motion[:, None], self.g_points[:, :, None])[:, 0]
+        if self.border is None:
+            return step
+        width = self.border.shape[2]
+        B = np.concatenate([np.zeros((p, width)), self.border.reshape(-1, width)])
+        bordered = apply(B[:p], self.border)
+        return np.asarray(
+            step - bordered @ np.linalg.solve(np.eye(width) + B.T @ bordered, B.T @ step)
+        )
 
     def predicted(self, step: Array) -> float:
         """Return -(g^T step + step^T N step / 2)."""
@@ -163,6 +177,8 @@ class Arrow:
         a, b = step[:p], step[p:].reshape(self.g_points.shape)
         curvature = a @ self.U @ a + 2.0 * np.einsum("p,mpk,mk->", a, self.W, b, optimize=True)
         curvature += np.einsum("mk,mkl,ml->", b, self.V, b, optimize=True)
+        if self.border is not None:
+            curvature += np.sum(np.einsum("mkr,mk->r", self.border, b) ** 2)
         return float(-(self.gradient @ step + 0.5 * curvature))
 
     def decrement(self) -> float:

@@ -6,6 +6,8 @@ import itertools
 import textwrap
 from collections.abc import Iterable, Sequence
 
+import sympy as sp
+
 from epigauge_derive.kernel import Input, Kernel, Output
 from epigauge_derive.program import Program
 
@@ -64,6 +66,14 @@ def used_entries(program: Program, argument: Input) -> list[tuple[int, tuple[int
         )
         if symbol in used
     ]
+
+
+def mostly_zero(output: Output, results: Sequence[sp.Expr]) -> bool:
+    """Return whether an output is better filled with zeros first and then with the rest."""
+    return (
+        not output.summed
+        and sum(expression.is_zero is True for expression in results) > len(results) / 2
+    )
 
 
 def argument_names(kernel: Kernel) -> list[str]:

@@ -14,6 +14,7 @@ from epigauge_derive.emitters._text import (
     file_header,
     indices,
     kernel_header,
+    mostly_zero,
     used_entries,
 )
 from epigauge_derive.kernel import Input, Kernel
@@ -61,7 +62,7 @@ def emit(programs: list[Program]) -> dict[str, str]:
     files = {}
     for family, members in families(programs).items():
         text = file_header(family, "/* {} */")
-        text += '#include "epigauge_kernels.h"\n\n#include <math.h>\n'
+        text += '#include "epigauge_kernels.h"\n\n#include <math.h>\n#include <string.h>\n'
         text += "".join(_function(program) for program in members)
         files[f"c/{family}.c"] = text
     prototypes = "".join(f"{_prototype(program.kernel)};\n\n" for program in programs)
@@ -113,6 +114,10 @@ def _function(program: Program) -> str:
                 lines.append(f"    const double {name} = {_pointer(argument)}[{position}];")
     for name, _, _ in sums:
         lines.append(f"    double {name} = 0.0;")
+    for output, results in zip(kernel.outputs, program.results, strict=True):
+        if mostly_zero(output, results):
+            fill = f"memset({output.name}, 0, {len(results)} * (size_t)n * sizeof(double));"
+            lines.append(f"    {fill}")
     unrolled = all(
         statement.passes * len(statement.body) <= _UNROLL
         for statement in program.statements
@@ -127,7 +132,10 @@ def _function(program: Program) -> str:
     for statement in program.statements:
         lines += _statement(statement, unrolled)
     for output, results in zip(kernel.outputs, program.results, strict=True):
+        sparse = mostly_zero(output, results)
         for position, expression in enumerate(results):
+            if sparse and expression.is_zero:
+                continue
             value = _printer(expression)
             if output.summed:
                 lines.append(f"        sum_{output.name}{position} += {value};")

@@ -55,6 +55,8 @@ def _function(program: Program) -> str:
         rows, columns = matrix_shape(output.shape)
         lines.append(f"    {output.name} = ca.SX({rows}, {columns})")
         for position, expression in enumerate(results):
+            if expression.is_zero:  # structurally zero in a new SX
+                continue
             place = f"{position // columns}, {position % columns}"
             lines.append(f"    {output.name}[{place}] = {_printer(expression)}")
     inputs = [argument.name for argument in kernel.inputs]

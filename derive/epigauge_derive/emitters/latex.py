@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sympy as sp
 
-from epigauge_derive.emitters._text import file_header, indices, kernel_header
+from epigauge_derive.emitters._text import file_header, indices, kernel_header, mostly_zero
 from epigauge_derive.program import Assignments, Program, Repeat
 
 
@@ -25,7 +25,12 @@ def _text(program: Program) -> str:
         else:
             lines += _equations(statement)
     for output, results in zip(kernel.outputs, program.results, strict=True):
+        sparse = mostly_zero(output, results)
+        if sparse:
+            lines.append(rf"{_entry(output.name, (), output.summed)} 0 \text{{ but for}}")
         for index, expression in zip(indices(output.shape), results, strict=True):
+            if sparse and expression.is_zero:
+                continue
             lines.append(f"{_entry(output.name, index, output.summed)} {sp.latex(expression)}")
     body = " \\\\\n".join(lines)
     header = "".join(f"% {line}\n" for line in kernel_header(program))

@@ -8,6 +8,7 @@ from epigauge_derive.emitters._text import (
     file_header,
     indices,
     kernel_header,
+    mostly_zero,
     used_entries,
 )
 from epigauge_derive.printer import Printer
@@ -40,7 +41,12 @@ def _function(program: Program) -> str:
     for statement in program.statements:
         lines += _statement(statement)
     for output, results in zip(kernel.outputs, program.results, strict=True):
+        sparse = mostly_zero(output, results)
+        if sparse:
+            lines.append(f"    {output.name}[...] = 0.0")
         for index, expression in zip(indices(output.shape), results, strict=True):
+            if sparse and expression.is_zero:
+                continue
             place = ", ".join(map(str, index)) or "..."
             value = _printer(expression)
             if output.summed:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sympy as sp
 
-from epigauge_derive.kernel import Input, Kernel, Output, jacobian
+from epigauge_derive.kernel import Input, Kernel, Output, jacobian, upper
 
 F = Input("F", (3, 3), shared=True)
 Q1, Q2 = Input("q1", (2,)), Input("q2", (2,))
@@ -15,36 +15,90 @@ def homogeneous(q: Input) -> sp.Matrix:
     return sp.Matrix([*q.entries(), 1])
 
 
+def constraint() -> sp.Expr:
+    """Return C = q'^T F q."""
+    return (homogeneous(Q2).T * F.matrix() * homogeneous(Q1))[0]
+
+
+def algebraic() -> list[sp.Expr]:
+    """Return the algebraic residual."""
+    return [constraint()]
+
+
+def epipolar() -> list[sp.Expr]:
+    """Return the signed distances of q to the line F^T q' and of q' to the line F q."""
+    lines = (F.matrix().T * homogeneous(Q2), F.matrix() * homogeneous(Q1))
+    return [constraint() / sp.sqrt(line[0] ** 2 + line[1] ** 2) for line in lines]
+
+
+def sampson() -> list[sp.Expr]:
+    """Return C over the length of its gradient by the match."""
+    C = constraint()
+    gradient = [sp.diff(C, entry) for entry in (*Q1.entries(), *Q2.entries())]
+    return [C / sp.sqrt(sum(entry**2 for entry in gradient))]
+
+
 def kernels() -> list[Kernel]:
-    """Return the algebraic, point-to-epipolar-line and gradient-weighted (Sampson) residuals."""
-    C = (homogeneous(Q2).T * F.matrix() * homogeneous(Q1))[0]
-    line1 = F.matrix().T * homogeneous(Q2)
-    line2 = F.matrix() * homogeneous(Q1)
-    gradient = sp.Matrix([C]).jacobian([*Q1.entries(), *Q2.entries()])
-    to_lines = [C / sp.sqrt(line[0] ** 2 + line[1] ** 2) for line in (line1, line2)]
-    sampson = C / sp.sqrt(sum(entry**2 for entry in gradient))
-    return [
-        _residual("algebraic", "r = q'^T F q (B&S section 4).", [C]),
-        _residual(
-            "epipolar_distances",
+    """Return residuals, and for the geometric ones what the solver sums up."""
+    made = [
+        *_residual("algebraic", "r = q'^T F q (B&S section 4).", algebraic()),
+    ]
+    for name, formula, residuals in (
+        (
+            "epipolar",
             "signed distances in pixels of q to the line F^T q' and of q' to the line F q (B&S "
             "section 4, point-to-epipolar-line criterion).",
-            to_lines,
+            epipolar(),
         ),
-        _residual(
+        (
             "sampson",
             "r = C / |dC/d(q, q')| with C = q'^T F q, in pixels (gradient-weighted criterion, B&S "
             "section 4).",
-            [sampson],
+            sampson(),
+        ),
+    ):
+        made += _residual(name, formula, residuals)
+        made += _normal_equations(name, residuals)
+    return made
+
+
+def _residual(name: str, formula: str, residuals: list[sp.Expr]) -> list[Kernel]:
+    derivatives = jacobian(residuals, F.entries())
+    shape = (len(residuals), 9)
+    outputs = (Output.of("r", residuals), Output("dr_dF", shape, tuple(derivatives)))
+    return [Kernel(name, formula, (F, Q1, Q2), outputs)]
+
+
+def _normal_equations(name: str, residuals: list[sp.Expr]) -> list[Kernel]:
+    """Return gradient with Gauss-Newton matrix, and with exact Hessian, of a robust sum.
+
+    The cost of a match is rho(s) / 2 with s the sum of its squared residuals: `weight` is rho' and
+    `curvature` 2 rho'', which multiplies the square of ds/dF / 2.
+    """
+    weight, curvature = Input("weight"), Input("curvature")
+    first = jacobian(residuals, F.entries())
+    half = first.T * sp.Matrix(residuals)
+    gauss_newton = first.T * first
+    second = gauss_newton.copy()
+    for r, row in zip(residuals, first.tolist(), strict=True):
+        second += r * jacobian(row, F.entries())
+    exact = weight.symbol() * second + curvature.symbol() * half * half.T
+    gradient = Output.of("g", weight.symbol() * half, summed=True)
+    normal = Output.of("N", upper(weight.symbol() * gauss_newton), summed=True)
+    arguments = (F, Q1, Q2, weight)
+    return [
+        Kernel(
+            f"{name}_gauss_newton",
+            f"gradient and Gauss-Newton matrix (upper triangle) by vect(F) of the weighted sum of "
+            f"squared {name} residuals, halved.",
+            arguments,
+            (gradient, normal),
+        ),
+        Kernel(
+            f"{name}_newton",
+            f"gradient and exact Hessian (upper triangle) by vect(F) of a robust sum of squared "
+            f"{name} residuals, halved.",
+            (*arguments, curvature),
+            (gradient, Output.of("H", upper(exact), summed=True)),
         ),
     ]
-
-
-def _residual(name: str, formula: str, residuals: list[sp.Expr]) -> Kernel:
-    derivatives = jacobian(residuals, F.entries())
-    return Kernel(
-        name,
-        formula,
-        (F, Q1, Q2),
-        (Output.of("r", residuals), Output("dr_dF", (len(residuals), 9), tuple(derivatives))),
-    )

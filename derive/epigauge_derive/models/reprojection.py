@@ -270,9 +270,8 @@ def exact_hessian(
 def _normal_equations() -> list[Kernel]:
     """Return what the solver adds up: gradient with Gauss-Newton matrix or exact Hessian.
 
-    Robust losses rho(d^2) enter by two weights a match: rho' on gradient and second derivative,
-    and 2 rho'' d^2 on the rank-one term of the exact Hessian. Derivatives are by vect(F) of the
-    rotated images; the chart's chain rule does the rest, whatever the parameterisation.
+    The cost of a match is rho(d^2) / 2: `weight` is rho' and `curvature` 2 rho'', which multiplies
+    the square of d * dd/dF = l * C_F. Derivatives are by vect(F) of the rotated images.
     """
     z, values, n = second_order_parts()
     l = MULTIPLIER.symbol()
@@ -282,9 +281,10 @@ def _normal_equations() -> list[Kernel]:
     # d * dd/dF = l |n| * C_F / |n|
     gradient = weight.symbol() * l * C_F
     gauss_newton = weight.symbol() * C_F * C_F.T / squared
-    stages = (rotate_match(), Let(values | {squared: sum(entry**2 for entry in n) + _TINY}))
+    stages = (rotate_match(), Let(values))
+    with_length = (rotate_match(), Let(values | {squared: sum(e**2 for e in n) + _TINY}))
     hessian, _ = exact_hessian(z, n, l)
-    exact = weight.symbol() * hessian + curvature.symbol() * C_F * C_F.T / squared
+    exact = weight.symbol() * hessian + curvature.symbol() * l**2 * C_F * C_F.T
     arguments = (*FRAME, Q1, Q2, MULTIPLIER, weight)
     return [
         Kernel(
@@ -296,13 +296,12 @@ def _normal_equations() -> list[Kernel]:
                 Output.of("g", gradient, summed=True),
                 Output.of("N", upper(gauss_newton), summed=True),
             ),
-            stages,
+            with_length,
         ),
         Kernel(
             "reprojection_newton",
-            "gradient and exact Hessian (upper triangle) of sum weight d^2 / 2 by vect(F) of the "
-            "rotated images, H = l C_FF - R^T K^-1 R, plus curvature times the rank-one term of "
-            "a robust loss.",
+            "gradient and exact Hessian (upper triangle) of a robust sum of d^2 / 2 by vect(F) of "
+            "the rotated images, from H = l C_FF - R^T K^-1 R for each match.",
             (*arguments, curvature),
             (
                 Output.of("g", gradient, summed=True),

@@ -32,7 +32,7 @@ def algebraic(F, q1, q2, r, dr_dF):
     dr_dF[0, 8] = 1.0
 
 
-def epipolar_distances(F, q1, q2, r, dr_dF):
+def epipolar(F, q1, q2, r, dr_dF):
     # Formula: signed distances in pixels of q to the line F^T q' and of q' to the line F q (B&S
     # section 4, point-to-epipolar-line criterion).
     # Inputs:  F (3, 3) shared, q1 (2,), q2 (2,)
@@ -92,6 +92,374 @@ def epipolar_distances(F, q1, q2, r, dr_dF):
     dr_dF[1, 8] = t8
 
 
+def epipolar_gauss_newton(F, q1, q2, weight, g, N):
+    # Formula: gradient and Gauss-Newton matrix (upper triangle) by vect(F) of the weighted sum
+    # of squared epipolar residuals, halved.
+    # Inputs:  F (3, 3) shared, q1 (2,), q2 (2,), weight ()
+    # Outputs: g (9,) summed, N (45,) summed
+    # Operations: 302, temporaries: 49.
+    F00 = F[0, 0]
+    F01 = F[0, 1]
+    F02 = F[0, 2]
+    F10 = F[1, 0]
+    F11 = F[1, 1]
+    F12 = F[1, 2]
+    F20 = F[2, 0]
+    F21 = F[2, 1]
+    F22 = F[2, 2]
+    q1_0 = q1[0]
+    q1_1 = q1[1]
+    q2_0 = q2[0]
+    q2_1 = q2[1]
+    t3 = F02 + F00*q1_0 + F01*q1_1
+    t4 = F12 + F10*q1_0 + F11*q1_1
+    t5 = t3*t3 + t4*t4
+    t6 = 1.0/np.sqrt(t5)
+    t7 = q2_0*t6
+    t0 = F20 + F00*q2_0 + F10*q2_1
+    t1 = F21 + F01*q2_0 + F11*q2_1
+    t2 = F22 + F02*q2_0 + F12*q2_1 + q1_0*t0 + q1_1*t1
+    t8 = t2/(t5*np.sqrt(t5))
+    t9 = t3*t8
+    t10 = q1_0*t7 - q1_0*t9
+    t11 = t10*t6
+    t12 = t0*t0 + t1*t1
+    t13 = 1.0/np.sqrt(t12)
+    t14 = q1_0*t13
+    t15 = t2/(t12*np.sqrt(t12))
+    t16 = q2_0*t15
+    t17 = q2_0*t14 - t0*t16
+    t18 = t13*t17
+    t19 = q1_1*t7 - q1_1*t9
+    t20 = t19*t6
+    t21 = q1_1*t13
+    t22 = q2_0*t21 - t1*t16
+    t23 = t13*t22
+    t24 = 1.0/t12
+    t25 = t2*t24
+    t26 = t7 - t3*t8
+    t27 = t26*t6
+    t28 = q2_1*t6
+    t29 = t4*t8
+    t30 = q1_0*t28 - q1_0*t29
+    t31 = t30*t6
+    t32 = q2_1*t15
+    t33 = q2_1*t14 - t0*t32
+    t34 = t13*t33
+    t35 = q1_1*t28 - q1_1*t29
+    t36 = t35*t6
+    t37 = q2_1*t21 - t1*t32
+    t38 = t13*t37
+    t39 = t28 - t4*t8
+    t40 = t39*t6
+    t41 = 1.0/t5
+    t42 = t2*t41
+    t43 = t14 - t0*t15
+    t44 = t13*t43
+    t45 = t21 - t1*t15
+    t46 = t13*t45
+    t47 = q2_0*t24
+    t48 = q1_0*t41
+    g[0] = np.add.reduce(weight*(t11*t2 + t18*t2), axis=-1)
+    g[1] = np.add.reduce(weight*(t2*t20 + t2*t23), axis=-1)
+    g[2] = np.add.reduce(weight*(q2_0*t25 + t2*t27), axis=-1)
+    g[3] = np.add.reduce(weight*(t2*t31 + t2*t34), axis=-1)
+    g[4] = np.add.reduce(weight*(t2*t36 + t2*t38), axis=-1)
+    g[5] = np.add.reduce(weight*(q2_1*t25 + t2*t40), axis=-1)
+    g[6] = np.add.reduce(weight*(q1_0*t42 + t2*t44), axis=-1)
+    g[7] = np.add.reduce(weight*(q1_1*t42 + t2*t46), axis=-1)
+    g[8] = np.add.reduce(weight*(t25 + t42), axis=-1)
+    N[0] = np.add.reduce(weight*(t10*t10 + t17*t17), axis=-1)
+    N[1] = np.add.reduce(weight*(t10*t19 + t17*t22), axis=-1)
+    N[2] = np.add.reduce(weight*(q2_0*t18 + t10*t26), axis=-1)
+    N[3] = np.add.reduce(weight*(t10*t30 + t17*t33), axis=-1)
+    N[4] = np.add.reduce(weight*(t10*t35 + t17*t37), axis=-1)
+    N[5] = np.add.reduce(weight*(q2_1*t18 + t10*t39), axis=-1)
+    N[6] = np.add.reduce(weight*(q1_0*t11 + t17*t43), axis=-1)
+    N[7] = np.add.reduce(weight*(q1_1*t11 + t17*t45), axis=-1)
+    N[8] = np.add.reduce(weight*(t11 + t18), axis=-1)
+    N[9] = np.add.reduce(weight*(t19*t19 + t22*t22), axis=-1)
+    N[10] = np.add.reduce(weight*(q2_0*t23 + t19*t26), axis=-1)
+    N[11] = np.add.reduce(weight*(t19*t30 + t22*t33), axis=-1)
+    N[12] = np.add.reduce(weight*(t19*t35 + t22*t37), axis=-1)
+    N[13] = np.add.reduce(weight*(q2_1*t23 + t19*t39), axis=-1)
+    N[14] = np.add.reduce(weight*(q1_0*t20 + t22*t43), axis=-1)
+    N[15] = np.add.reduce(weight*(q1_1*t20 + t22*t45), axis=-1)
+    N[16] = np.add.reduce(weight*(t20 + t23), axis=-1)
+    N[17] = np.add.reduce(weight*(t26*t26 + q2_0*q2_0*t24), axis=-1)
+    N[18] = np.add.reduce(weight*(q2_0*t34 + t26*t30), axis=-1)
+    N[19] = np.add.reduce(weight*(q2_0*t38 + t26*t35), axis=-1)
+    N[20] = np.add.reduce(weight*(q2_1*t47 + t26*t39), axis=-1)
+    N[21] = np.add.reduce(weight*(q1_0*t27 + q2_0*t44), axis=-1)
+    N[22] = np.add.reduce(weight*(q1_1*t27 + q2_0*t46), axis=-1)
+    N[23] = np.add.reduce(weight*(t27 + t47), axis=-1)
+    N[24] = np.add.reduce(weight*(t30*t30 + t33*t33), axis=-1)
+    N[25] = np.add.reduce(weight*(t30*t35 + t33*t37), axis=-1)
+    N[26] = np.add.reduce(weight*(q2_1*t34 + t30*t39), axis=-1)
+    N[27] = np.add.reduce(weight*(q1_0*t31 + t33*t43), axis=-1)
+    N[28] = np.add.reduce(weight*(q1_1*t31 + t33*t45), axis=-1)
+    N[29] = np.add.reduce(weight*(t31 + t34), axis=-1)
+    N[30] = np.add.reduce(weight*(t35*t35 + t37*t37), axis=-1)
+    N[31] = np.add.reduce(weight*(q2_1*t38 + t35*t39), axis=-1)
+    N[32] = np.add.reduce(weight*(q1_0*t36 + t37*t43), axis=-1)
+    N[33] = np.add.reduce(weight*(q1_1*t36 + t37*t45), axis=-1)
+    N[34] = np.add.reduce(weight*(t36 + t38), axis=-1)
+    N[35] = np.add.reduce(weight*(t39*t39 + q2_1*q2_1*t24), axis=-1)
+    N[36] = np.add.reduce(weight*(q1_0*t40 + q2_1*t44), axis=-1)
+    N[37] = np.add.reduce(weight*(q1_1*t40 + q2_1*t46), axis=-1)
+    N[38] = np.add.reduce(weight*(t40 + q2_1*t24), axis=-1)
+    N[39] = np.add.reduce(weight*(t43*t43 + q1_0*q1_0*t41), axis=-1)
+    N[40] = np.add.reduce(weight*(q1_1*t48 + t43*t45), axis=-1)
+    N[41] = np.add.reduce(weight*(t44 + t48), axis=-1)
+    N[42] = np.add.reduce(weight*(t45*t45 + q1_1*q1_1*t41), axis=-1)
+    N[43] = np.add.reduce(weight*(t46 + q1_1*t41), axis=-1)
+    N[44] = np.add.reduce(weight*(t24 + t41), axis=-1)
+
+
+def epipolar_newton(F, q1, q2, weight, curvature, g, H):
+    # Formula: gradient and exact Hessian (upper triangle) by vect(F) of a robust sum of squared
+    # epipolar residuals, halved.
+    # Inputs:  F (3, 3) shared, q1 (2,), q2 (2,), weight (), curvature ()
+    # Outputs: g (9,) summed, H (45,) summed
+    # Operations: 958, temporaries: 169.
+    F00 = F[0, 0]
+    F01 = F[0, 1]
+    F02 = F[0, 2]
+    F10 = F[1, 0]
+    F11 = F[1, 1]
+    F12 = F[1, 2]
+    F20 = F[2, 0]
+    F21 = F[2, 1]
+    F22 = F[2, 2]
+    q1_0 = q1[0]
+    q1_1 = q1[1]
+    q2_0 = q2[0]
+    q2_1 = q2[1]
+    t10 = F01*q1_1
+    t9 = F00*q1_0
+    t11 = F02 + t10 + t9
+    t12 = t11*t11
+    t13 = F10*q1_0
+    t14 = F11*q1_1
+    t15 = F12 + t13 + t14
+    t16 = t15*t15
+    t17 = t12 + t16
+    t18 = 1.0/np.sqrt(t17)
+    t19 = q2_0*t18
+    t20 = 1.0/(t17*np.sqrt(t17))
+    t0 = F00*q2_0
+    t1 = F10*q2_1
+    t2 = F20 + t0 + t1
+    t3 = q1_0*t2
+    t4 = F01*q2_0
+    t5 = F11*q2_1
+    t6 = F21 + t4 + t5
+    t7 = q1_1*t6
+    t8 = F22 + t3 + t7 + F02*q2_0 + F12*q2_1
+    t21 = t20*t8
+    t22 = q1_0*t21
+    t23 = q1_0*t19 - t11*t22
+    t24 = t18*t23
+    t25 = t2*t2
+    t26 = t6*t6
+    t27 = t25 + t26
+    t28 = 1.0/np.sqrt(t27)
+    t29 = q1_0*t28
+    t30 = 1.0/(t27*np.sqrt(t27))
+    t31 = t30*t8
+    t32 = q2_0*t31
+    t33 = q2_0*t29 - t2*t32
+    t34 = t28*t33
+    t35 = t24*t8 + t34*t8
+    t36 = q1_1*t21
+    t37 = q1_1*t19 - t11*t36
+    t38 = t18*t37
+    t39 = q1_1*t28
+    t40 = q2_0*t39 - t32*t6
+    t41 = t28*t40
+    t42 = t38*t8 + t41*t8
+    t43 = 1.0/t27
+    t44 = t43*t8
+    t45 = -t11
+    t46 = t19 + t21*t45
+    t47 = t18*t46
+    t48 = q2_0*t44 + t47*t8
+    t49 = q2_1*t18
+    t50 = q1_0*t49 - t15*t22
+    t51 = t18*t50
+    t52 = q2_1*t31
+    t53 = q2_1*t29 - t2*t52
+    t54 = t28*t53
+    t55 = t51*t8 + t54*t8
+    t56 = q1_1*t49 - t15*t36
+    t57 = t18*t56
+    t58 = q2_1*t39 - t52*t6
+    t59 = t28*t58
+    t60 = t57*t8 + t59*t8
+    t61 = -t15
+    t62 = t49 + t21*t61
+    t63 = t18*t62
+    t64 = q2_1*t44 + t63*t8
+    t65 = 1.0/t17
+    t66 = t65*t8
+    t67 = -t2
+    t68 = t29 + t31*t67
+    t69 = t28*t68
+    t70 = q1_0*t66 + t69*t8
+    t71 = -t6
+    t72 = t39 + t31*t71
+    t73 = t28*t72
+    t74 = q1_1*t66 + t73*t8
+    t75 = t44 + t66
+    t76 = q1_0*q1_0
+    t77 = q2_0*t20
+    t78 = 2.0*t77
+    t79 = t11*t78
+    t80 = t21*t76
+    t81 = 1.0/(t17*t17*np.sqrt(t17))
+    t82 = t18*t8
+    t83 = q2_0*q2_0
+    t84 = 2.0*t30
+    t85 = t83*t84
+    t86 = t31*t83
+    t87 = 1.0/(t27*t27*np.sqrt(t27))
+    t88 = t28*t8
+    t89 = curvature*t35
+    t90 = q1_0*t30
+    t91 = t6*t83
+    t92 = q1_1*t30
+    t93 = t2*t83
+    t94 = q1_0*t77
+    t95 = t11*t94
+    t96 = 2.0*q1_1
+    t97 = q1_1*t22
+    t100 = -3.0*F02 - 3.0*t10 - 3.0*t9
+    t101 = t8*t81
+    t102 = t100*t101
+    t98 = t8/(t27*t27)
+    t99 = q1_0*t11
+    t103 = t15*t77
+    t104 = q2_1*t20
+    t105 = t104*t11
+    t106 = q2_0*t30
+    t107 = t106*t3
+    t108 = 2.0*q2_1
+    t109 = q2_1*t32
+    t110 = t15*t94
+    t111 = q1_0*t105
+    t112 = q2_0*t6*t90
+    t113 = q2_0*t2
+    t114 = t113*t92
+    t115 = t82*(3.0*q1_0*q1_1*t11*t15*t8*t81 - q1_1*t110 - q1_1*t111) + t88*(3.0*q2_0*q2_1*t2*t6*t8*t87 - q2_1*t112 - q2_1*t114)
+    t116 = t113*t98
+    t117 = -q2_1*t116
+    t118 = -3.0*F12 - 3.0*t13 - 3.0*t14
+    t119 = t101*t118
+    t120 = t8/(t17*t17)
+    t121 = t11*t120
+    t122 = -3.0*F20 - 3.0*t0 - 3.0*t1
+    t123 = t8*t87
+    t124 = t122*t123
+    t125 = q1_0*t121
+    t126 = -q1_1*t125
+    t127 = -3.0*F21 - 3.0*t4 - 3.0*t5
+    t128 = t123*t127
+    t129 = q1_1*q1_1
+    t130 = t129*t21
+    t131 = curvature*t42
+    t132 = q1_1*t11
+    t133 = t106*t7
+    t134 = t6*t98
+    t135 = q2_0*t134
+    t136 = -q2_1*t135
+    t137 = q2_0*t6
+    t138 = -t21
+    t139 = t101*t45
+    t140 = curvature*t48
+    t141 = 3.0*t139*t15
+    t142 = q2_0*t43
+    t143 = t120*t45
+    t144 = t67*t98
+    t145 = t71*t98
+    t146 = 2.0*t104
+    t147 = t146*t15
+    t148 = q2_1*q2_1
+    t149 = t148*t84
+    t150 = t148*t31
+    t151 = curvature*t55
+    t152 = t6*t90
+    t153 = t148*t2
+    t154 = q1_0*t104*t15
+    t155 = t119*t15
+    t156 = t120*t15
+    t157 = q2_1*t30
+    t158 = q2_1*t2
+    t159 = q1_0*t156
+    t160 = -q1_1*t159
+    t161 = curvature*t60
+    t162 = q2_1*t6
+    t163 = t120*t61
+    t164 = curvature*t64
+    t165 = -t31
+    t166 = t123*t67
+    t167 = curvature*t70
+    t168 = q1_0*t65
+    g[0] = np.add.reduce(t35*weight, axis=-1)
+    g[1] = np.add.reduce(t42*weight, axis=-1)
+    g[2] = np.add.reduce(t48*weight, axis=-1)
+    g[3] = np.add.reduce(t55*weight, axis=-1)
+    g[4] = np.add.reduce(t60*weight, axis=-1)
+    g[5] = np.add.reduce(t64*weight, axis=-1)
+    g[6] = np.add.reduce(t70*weight, axis=-1)
+    g[7] = np.add.reduce(t74*weight, axis=-1)
+    g[8] = np.add.reduce(t75*weight, axis=-1)
+    H[0] = np.add.reduce(curvature*t35*t35 + weight*(t23*t23 + t33*t33 + t82*(3.0*t12*t76*t8*t81 - t80 - t76*t79) + t88*(3.0*t25*t8*t83*t87 - t86 - t3*t85)), axis=-1)
+    H[1] = np.add.reduce(t42*t89 + weight*(t23*t37 + t33*t40 + t82*(3.0*q1_0*q1_1*t12*t8*t81 - t97 - t95*t96) + t88*(3.0*t2*t6*t8*t83*t87 - t90*t91 - t92*t93)), axis=-1)
+    H[2] = np.add.reduce(t48*t89 + weight*(q2_0*t34 + t23*t46 + t82*(q1_0*q2_0*t20*t45 - t22 - t95 - t102*t99) - t93*t98), axis=-1)
+    H[3] = np.add.reduce(t55*t89 + weight*(t23*t50 + t33*t53 + t82*(3.0*t11*t15*t76*t8*t81 - t103*t76 - t105*t76) + t88*(3.0*q2_0*q2_1*t25*t8*t87 - t109 - t107*t108)), axis=-1)
+    H[4] = np.add.reduce(t60*t89 + weight*(t115 + t23*t56 + t33*t58), axis=-1)
+    H[5] = np.add.reduce(t64*t89 + weight*(t117 + q2_1*t34 + t23*t62 + t82*(q1_0*q2_0*t20*t61 - t111 - t119*t99)), axis=-1)
+    H[6] = np.add.reduce(t70*t89 + weight*(q1_0*t24 + t33*t68 + t88*(q1_0*q2_0*t30*t67 - t107 - t32 - t113*t124) - t121*t76), axis=-1)
+    H[7] = np.add.reduce(t74*t89 + weight*(t126 + q1_1*t24 + t33*t72 + t88*(q1_0*q2_0*t30*t71 - t114 - t113*t128)), axis=-1)
+    H[8] = np.add.reduce(t75*t89 + weight*(t18*t23 + t28*t33 - t116 - t125), axis=-1)
+    H[9] = np.add.reduce(curvature*t42*t42 + weight*(t37*t37 + t40*t40 + t82*(3.0*t12*t129*t8*t81 - t130 - t129*t79) + t88*(3.0*t26*t8*t83*t87 - t86 - t7*t85)), axis=-1)
+    H[10] = np.add.reduce(t131*t48 + weight*(q2_0*t41 + t37*t46 + t82*(q1_1*q2_0*t20*t45 - t36 - t102*t132 - q1_1*t11*t77) - t91*t98), axis=-1)
+    H[11] = np.add.reduce(t131*t55 + weight*(t115 + t37*t50 + t40*t53), axis=-1)
+    H[12] = np.add.reduce(t131*t60 + weight*(t37*t56 + t40*t58 + t82*(3.0*t11*t129*t15*t8*t81 - t103*t129 - t105*t129) + t88*(3.0*q2_0*q2_1*t26*t8*t87 - t109 - t108*t133)), axis=-1)
+    H[13] = np.add.reduce(t131*t64 + weight*(t136 + q2_1*t41 + t37*t62 + t82*(q1_1*q2_0*t20*t61 - q1_1*t105 - t119*t132)), axis=-1)
+    H[14] = np.add.reduce(t131*t70 + weight*(t126 + q1_0*t38 + t40*t68 + t88*(q1_1*q2_0*t30*t67 - t112 - t124*t137)), axis=-1)
+    H[15] = np.add.reduce(t131*t74 + weight*(q1_1*t38 + t40*t72 + t88*(q1_1*q2_0*t30*t71 - t133 - t32 - t128*t137) - t121*t129), axis=-1)
+    H[16] = np.add.reduce(t131*t75 + weight*(t18*t37 + t28*t40 - t135 - q1_1*t121), axis=-1)
+    H[17] = np.add.reduce(curvature*t48*t48 + weight*(t46*t46 + t43*t83 + t82*(t138 + t100*t139 + t45*t78)), axis=-1)
+    H[18] = np.add.reduce(t140*t55 + weight*(t117 + q2_0*t54 + t46*t50 + t82*(q1_0*q2_1*t20*t45 - t110 - q1_0*t141)), axis=-1)
+    H[19] = np.add.reduce(t140*t60 + weight*(t136 + q2_0*t59 + t46*t56 + t82*(q1_1*q2_1*t20*t45 - q1_1*t103 - q1_1*t141)), axis=-1)
+    H[20] = np.add.reduce(t140*t64 + weight*(q2_1*t142 + t46*t62 + t82*(t104*t45 + t118*t139 + t61*t77)), axis=-1)
+    H[21] = np.add.reduce(t140*t70 + weight*(q1_0*t143 + q1_0*t47 + q2_0*t144 + q2_0*t69), axis=-1)
+    H[22] = np.add.reduce(t140*t74 + weight*(q1_1*t143 + q1_1*t47 + q2_0*t145 + q2_0*t73), axis=-1)
+    H[23] = np.add.reduce(t140*t75 + weight*(t142 + t143 + t47), axis=-1)
+    H[24] = np.add.reduce(curvature*t55*t55 + weight*(t50*t50 + t53*t53 + t82*(3.0*t16*t76*t8*t81 - t80 - t147*t76) + t88*(3.0*t148*t25*t8*t87 - t150 - t149*t3)), axis=-1)
+    H[25] = np.add.reduce(t151*t60 + weight*(t50*t56 + t53*t58 + t82*(3.0*q1_0*q1_1*t16*t8*t81 - t97 - t154*t96) + t88*(3.0*t148*t2*t6*t8*t87 - t148*t152 - t153*t92)), axis=-1)
+    H[26] = np.add.reduce(t151*t64 + weight*(q2_1*t54 + t50*t62 + t82*(q1_0*q2_1*t20*t61 - t154 - t22 - q1_0*t155) - t153*t98), axis=-1)
+    H[27] = np.add.reduce(t151*t70 + weight*(q1_0*t51 + t53*t68 + t88*(q1_0*q2_1*t30*t67 - t52 - t124*t158 - t157*t3) - t156*t76), axis=-1)
+    H[28] = np.add.reduce(t151*t74 + weight*(t160 + q1_1*t51 + t53*t72 + t88*(q1_0*q2_1*t30*t71 - t128*t158 - t158*t92)), axis=-1)
+    H[29] = np.add.reduce(t151*t75 + weight*(t18*t50 + t28*t53 - t159 - t158*t98), axis=-1)
+    H[30] = np.add.reduce(curvature*t60*t60 + weight*(t56*t56 + t58*t58 + t82*(3.0*t129*t16*t8*t81 - t130 - t129*t147) + t88*(3.0*t148*t26*t8*t87 - t150 - t149*t7)), axis=-1)
+    H[31] = np.add.reduce(t161*t64 + weight*(q2_1*t59 + t56*t62 + t82*(q1_1*q2_1*t20*t61 - t36 - q1_1*t155 - q1_1*t104*t15) - t134*t148), axis=-1)
+    H[32] = np.add.reduce(t161*t70 + weight*(t160 + q1_0*t57 + t58*t68 + t88*(q1_1*q2_1*t30*t67 - q2_1*t152 - t124*t162)), axis=-1)
+    H[33] = np.add.reduce(t161*t74 + weight*(q1_1*t57 + t58*t72 + t88*(q1_1*q2_1*t30*t71 - t52 - t128*t162 - t157*t7) - t129*t156), axis=-1)
+    H[34] = np.add.reduce(t161*t75 + weight*(t18*t56 + t28*t58 - q1_1*t156 - q2_1*t134), axis=-1)
+    H[35] = np.add.reduce(curvature*t64*t64 + weight*(t62*t62 + t148*t43 + t82*(t138 + t119*t61 + t146*t61)), axis=-1)
+    H[36] = np.add.reduce(t164*t70 + weight*(q1_0*t163 + q1_0*t63 + q2_1*t144 + q2_1*t69), axis=-1)
+    H[37] = np.add.reduce(t164*t74 + weight*(q1_1*t163 + q1_1*t63 + q2_1*t145 + q2_1*t73), axis=-1)
+    H[38] = np.add.reduce(t164*t75 + weight*(t163 + t63 + q2_1*t43), axis=-1)
+    H[39] = np.add.reduce(curvature*t70*t70 + weight*(t68*t68 + t65*t76 + t88*(t165 + t122*t166 + 2.0*t67*t90)), axis=-1)
+    H[40] = np.add.reduce(t167*t74 + weight*(q1_1*t168 + t68*t72 + t88*(t127*t166 + t67*t92 + t71*t90)), axis=-1)
+    H[41] = np.add.reduce(t167*t75 + weight*(t144 + t168 + t69), axis=-1)
+    H[42] = np.add.reduce(curvature*t74*t74 + weight*(t72*t72 + t129*t65 + t88*(t165 + t128*t71 + 2.0*t71*t92)), axis=-1)
+    H[43] = np.add.reduce(weight*(t145 + t73 + q1_1*t65) + curvature*t74*t75, axis=-1)
+    H[44] = np.add.reduce(curvature*t75*t75 + weight*(t43 + t65), axis=-1)
+
+
 def sampson(F, q1, q2, r, dr_dF):
     # Formula: r = C / |dC/d(q, q')| with C = q'^T F q, in pixels (gradient-weighted criterion,
     # B&S section 4).
@@ -131,3 +499,340 @@ def sampson(F, q1, q2, r, dr_dF):
     dr_dF[0, 6] = q1_0*t6 - t0*t8
     dr_dF[0, 7] = q1_1*t6 - t1*t8
     dr_dF[0, 8] = t6
+
+
+def sampson_gauss_newton(F, q1, q2, weight, g, N):
+    # Formula: gradient and Gauss-Newton matrix (upper triangle) by vect(F) of the weighted sum
+    # of squared sampson residuals, halved.
+    # Inputs:  F (3, 3) shared, q1 (2,), q2 (2,), weight ()
+    # Outputs: g (9,) summed, N (45,) summed
+    # Operations: 147, temporaries: 34.
+    F00 = F[0, 0]
+    F01 = F[0, 1]
+    F02 = F[0, 2]
+    F10 = F[1, 0]
+    F11 = F[1, 1]
+    F12 = F[1, 2]
+    F20 = F[2, 0]
+    F21 = F[2, 1]
+    F22 = F[2, 2]
+    q1_0 = q1[0]
+    q1_1 = q1[1]
+    q2_0 = q2[0]
+    q2_1 = q2[1]
+    t0 = F20 + F00*q2_0 + F10*q2_1
+    t3 = F02 + F00*q1_0 + F01*q1_1
+    t1 = F21 + F01*q2_0 + F11*q2_1
+    t4 = F12 + F10*q1_0 + F11*q1_1
+    t5 = t0*t0 + t1*t1 + t3*t3 + t4*t4
+    t6 = 1.0/np.sqrt(t5)
+    t7 = q2_0*t6
+    t2 = F22 + F02*q2_0 + F12*q2_1 + q1_0*t0 + q1_1*t1
+    t8 = t2/(t5*np.sqrt(t5))
+    t9 = q1_0*t7 + t8*(-q1_0*t3 - q2_0*t0)
+    t10 = t9*weight
+    t11 = t10*t6
+    t12 = q1_1*t7 + t8*(-q1_1*t3 - q2_0*t1)
+    t13 = t12*weight
+    t14 = t13*t6
+    t15 = t7 - t3*t8
+    t16 = t15*weight
+    t17 = t16*t6
+    t18 = q2_1*t6
+    t19 = q1_0*t18 + t8*(-q1_0*t4 - q2_1*t0)
+    t20 = t19*weight
+    t21 = t20*t6
+    t22 = q1_1*t18 + t8*(-q1_1*t4 - q2_1*t1)
+    t23 = t22*weight
+    t24 = t23*t6
+    t25 = t18 - t4*t8
+    t26 = t25*weight
+    t27 = t26*t6
+    t28 = q1_0*t6 - t0*t8
+    t29 = t28*weight
+    t30 = t29*t6
+    t31 = q1_1*t6 - t1*t8
+    t32 = t31*t6*weight
+    t33 = weight/t5
+    g[0] = np.add.reduce(t11*t2, axis=-1)
+    g[1] = np.add.reduce(t14*t2, axis=-1)
+    g[2] = np.add.reduce(t17*t2, axis=-1)
+    g[3] = np.add.reduce(t2*t21, axis=-1)
+    g[4] = np.add.reduce(t2*t24, axis=-1)
+    g[5] = np.add.reduce(t2*t27, axis=-1)
+    g[6] = np.add.reduce(t2*t30, axis=-1)
+    g[7] = np.add.reduce(t2*t32, axis=-1)
+    g[8] = np.add.reduce(t2*t33, axis=-1)
+    N[0] = np.add.reduce(t9*t9*weight, axis=-1)
+    N[1] = np.add.reduce(t10*t12, axis=-1)
+    N[2] = np.add.reduce(t10*t15, axis=-1)
+    N[3] = np.add.reduce(t10*t19, axis=-1)
+    N[4] = np.add.reduce(t10*t22, axis=-1)
+    N[5] = np.add.reduce(t10*t25, axis=-1)
+    N[6] = np.add.reduce(t10*t28, axis=-1)
+    N[7] = np.add.reduce(t10*t31, axis=-1)
+    N[8] = np.add.reduce(t11, axis=-1)
+    N[9] = np.add.reduce(t12*t12*weight, axis=-1)
+    N[10] = np.add.reduce(t13*t15, axis=-1)
+    N[11] = np.add.reduce(t13*t19, axis=-1)
+    N[12] = np.add.reduce(t13*t22, axis=-1)
+    N[13] = np.add.reduce(t13*t25, axis=-1)
+    N[14] = np.add.reduce(t13*t28, axis=-1)
+    N[15] = np.add.reduce(t13*t31, axis=-1)
+    N[16] = np.add.reduce(t14, axis=-1)
+    N[17] = np.add.reduce(t15*t15*weight, axis=-1)
+    N[18] = np.add.reduce(t16*t19, axis=-1)
+    N[19] = np.add.reduce(t16*t22, axis=-1)
+    N[20] = np.add.reduce(t16*t25, axis=-1)
+    N[21] = np.add.reduce(t16*t28, axis=-1)
+    N[22] = np.add.reduce(t16*t31, axis=-1)
+    N[23] = np.add.reduce(t17, axis=-1)
+    N[24] = np.add.reduce(t19*t19*weight, axis=-1)
+    N[25] = np.add.reduce(t20*t22, axis=-1)
+    N[26] = np.add.reduce(t20*t25, axis=-1)
+    N[27] = np.add.reduce(t20*t28, axis=-1)
+    N[28] = np.add.reduce(t20*t31, axis=-1)
+    N[29] = np.add.reduce(t21, axis=-1)
+    N[30] = np.add.reduce(t22*t22*weight, axis=-1)
+    N[31] = np.add.reduce(t23*t25, axis=-1)
+    N[32] = np.add.reduce(t23*t28, axis=-1)
+    N[33] = np.add.reduce(t23*t31, axis=-1)
+    N[34] = np.add.reduce(t24, axis=-1)
+    N[35] = np.add.reduce(t25*t25*weight, axis=-1)
+    N[36] = np.add.reduce(t26*t28, axis=-1)
+    N[37] = np.add.reduce(t26*t31, axis=-1)
+    N[38] = np.add.reduce(t27, axis=-1)
+    N[39] = np.add.reduce(t28*t28*weight, axis=-1)
+    N[40] = np.add.reduce(t29*t31, axis=-1)
+    N[41] = np.add.reduce(t30, axis=-1)
+    N[42] = np.add.reduce(t31*t31*weight, axis=-1)
+    N[43] = np.add.reduce(t32, axis=-1)
+    N[44] = np.add.reduce(t33, axis=-1)
+
+
+def sampson_newton(F, q1, q2, weight, curvature, g, H):
+    # Formula: gradient and exact Hessian (upper triangle) by vect(F) of a robust sum of squared
+    # sampson residuals, halved.
+    # Inputs:  F (3, 3) shared, q1 (2,), q2 (2,), weight (), curvature ()
+    # Outputs: g (9,) summed, H (45,) summed
+    # Operations: 648, temporaries: 153.
+    F00 = F[0, 0]
+    F01 = F[0, 1]
+    F02 = F[0, 2]
+    F10 = F[1, 0]
+    F11 = F[1, 1]
+    F12 = F[1, 2]
+    F20 = F[2, 0]
+    F21 = F[2, 1]
+    F22 = F[2, 2]
+    q1_0 = q1[0]
+    q1_1 = q1[1]
+    q2_0 = q2[0]
+    q2_1 = q2[1]
+    t10 = F11*q1_1
+    t9 = F10*q1_0
+    t11 = F12 + t10 + t9
+    t0 = F00*q1_0
+    t1 = F01*q1_1
+    t2 = F02 + t0 + t1
+    t3 = F00*q2_0
+    t4 = F10*q2_1
+    t5 = F20 + t3 + t4
+    t6 = F01*q2_0
+    t7 = F11*q2_1
+    t8 = F21 + t6 + t7
+    t12 = t11*t11 + t2*t2 + t5*t5 + t8*t8
+    t13 = 1.0/np.sqrt(t12)
+    t14 = q2_0*t13
+    t15 = q1_0*t2
+    t16 = q2_0*t5
+    t17 = -t15 - t16
+    t18 = F22 + F02*q2_0 + F12*q2_1 + q1_0*t5 + q1_1*t8
+    t19 = 1.0/(t12*np.sqrt(t12))
+    t20 = t18*t19
+    t21 = q1_0*t14 + t17*t20
+    t22 = t13*t21
+    t23 = t18*weight
+    t24 = q1_1*t2
+    t25 = q2_0*t8
+    t26 = -t24 - t25
+    t27 = q1_1*t14 + t20*t26
+    t28 = t13*t27
+    t29 = -t2
+    t30 = t14 + t20*t29
+    t31 = t13*t30
+    t32 = q2_1*t13
+    t33 = q1_0*t11
+    t34 = q2_1*t5
+    t35 = -t33 - t34
+    t36 = q1_0*t32 + t20*t35
+    t37 = t13*t36
+    t38 = q1_1*t11
+    t39 = q2_1*t8
+    t40 = -t38 - t39
+    t41 = q1_1*t32 + t20*t40
+    t42 = t13*t41
+    t43 = -t11
+    t44 = t32 + t20*t43
+    t45 = t13*t44
+    t46 = -t5
+    t47 = q1_0*t13 + t20*t46
+    t48 = t13*t47
+    t49 = -t8
+    t50 = q1_1*t13 + t20*t49
+    t51 = t13*t50
+    t52 = 1.0/t12
+    t53 = t52*weight
+    t54 = t21*t21
+    t55 = curvature*t18*t18
+    t56 = t52*t55
+    t57 = t17*t19
+    t58 = q2_0*t57
+    t59 = 2.0*q1_0
+    t60 = q1_0*q1_0
+    t61 = q2_0*q2_0
+    t62 = t18/(t12*t12*np.sqrt(t12))
+    t63 = t17*t62
+    t64 = t13*t18
+    t65 = t21*t27
+    t66 = t19*t26
+    t67 = q2_0*t66
+    t68 = q1_0*t20
+    t69 = -q1_1*t68
+    t70 = -3.0*t24 - 3.0*t25
+    t71 = t21*t30
+    t72 = q2_0*t19
+    t73 = t29*t72
+    t74 = -t68
+    t75 = -3.0*F02 - 3.0*t0 - 3.0*t1
+    t76 = t21*t36
+    t77 = t35*t72
+    t78 = q2_1*t57
+    t79 = q2_0*t20
+    t80 = -q2_1*t79
+    t81 = -3.0*t33 - 3.0*t34
+    t82 = t21*t41
+    t83 = t40*t72
+    t84 = -3.0*t38 - 3.0*t39
+    t85 = t21*t44
+    t86 = t43*t72
+    t87 = -3.0*F12 - 3.0*t10 - 3.0*t9
+    t88 = t21*t47
+    t89 = t46*t72
+    t90 = -t79
+    t91 = -3.0*F20 - 3.0*t3 - 3.0*t4
+    t92 = t21*t50
+    t93 = t49*t72
+    t94 = -3.0*F21 - 3.0*t6 - 3.0*t7
+    t95 = t19*t55
+    t96 = 1.0/(t12*t12)
+    t97 = t18*t96
+    t100 = q1_1*q1_1
+    t101 = t26*t62
+    t98 = t27*t27
+    t99 = 2.0*q1_1
+    t102 = t27*t30
+    t103 = -q1_1*t20
+    t104 = t27*t36
+    t105 = q2_1*t66
+    t106 = t27*t41
+    t107 = t27*t44
+    t108 = t27*t47
+    t109 = t27*t50
+    t110 = t30*t30
+    t111 = -t20
+    t112 = t29*t62
+    t113 = t30*t36
+    t114 = t19*t29
+    t115 = q2_1*t114
+    t116 = t30*t41
+    t117 = t30*t44
+    t118 = t30*t47
+    t119 = t30*t50
+    t120 = t36*t36
+    t121 = t19*t35
+    t122 = q2_1*t121
+    t123 = q2_1*q2_1
+    t124 = t35*t62
+    t125 = t36*t41
+    t126 = t19*t40
+    t127 = q2_1*t126
+    t128 = t36*t44
+    t129 = t19*t43
+    t130 = q1_0*t129
+    t131 = t36*t47
+    t132 = q2_1*t19
+    t133 = t132*t46
+    t134 = -q2_1*t20
+    t135 = t36*t50
+    t136 = t132*t49
+    t137 = t41*t41
+    t138 = t40*t62
+    t139 = t41*t44
+    t140 = q1_1*t129
+    t141 = t41*t47
+    t142 = t41*t50
+    t143 = t44*t44
+    t144 = t43*t62
+    t145 = t44*t47
+    t146 = t44*t50
+    t147 = t47*t47
+    t148 = q1_0*t19
+    t149 = t46*t62
+    t150 = t47*t50
+    t151 = q1_1*t19
+    t152 = t50*t50
+    g[0] = np.add.reduce(t22*t23, axis=-1)
+    g[1] = np.add.reduce(t23*t28, axis=-1)
+    g[2] = np.add.reduce(t23*t31, axis=-1)
+    g[3] = np.add.reduce(t23*t37, axis=-1)
+    g[4] = np.add.reduce(t23*t42, axis=-1)
+    g[5] = np.add.reduce(t23*t45, axis=-1)
+    g[6] = np.add.reduce(t23*t48, axis=-1)
+    g[7] = np.add.reduce(t23*t51, axis=-1)
+    g[8] = np.add.reduce(t18*t53, axis=-1)
+    H[0] = np.add.reduce(t54*t56 + weight*(t54 + t64*(t20*(-t60 - t61) + t58*t59 + t63*(-3.0*t15 - 3.0*t16))), axis=-1)
+    H[1] = np.add.reduce(t56*t65 + weight*(t65 + t64*(t69 + q1_0*t67 + q1_1*t58 + t63*t70)), axis=-1)
+    H[2] = np.add.reduce(t56*t71 + weight*(t71 + t64*(t58 + t74 + q1_0*t73 + t63*t75)), axis=-1)
+    H[3] = np.add.reduce(t56*t76 + weight*(t76 + t64*(t80 + q1_0*t77 + q1_0*t78 + t63*t81)), axis=-1)
+    H[4] = np.add.reduce(t56*t82 + weight*(t82 + t64*(q1_0*t83 + q1_1*t78 + t63*t84)), axis=-1)
+    H[5] = np.add.reduce(t56*t85 + weight*(t85 + t64*(t78 + q1_0*t86 + t63*t87)), axis=-1)
+    H[6] = np.add.reduce(t56*t88 + weight*(t88 + t64*(t90 + q1_0*t57 + q1_0*t89 + t63*t91)), axis=-1)
+    H[7] = np.add.reduce(t56*t92 + weight*(t92 + t64*(q1_0*t93 + q1_1*t57 + t63*t94)), axis=-1)
+    H[8] = np.add.reduce(t21*t95 + weight*(t22 + t17*t97), axis=-1)
+    H[9] = np.add.reduce(t56*t98 + weight*(t98 + t64*(t101*t70 + t20*(-t100 - t61) + t67*t99)), axis=-1)
+    H[10] = np.add.reduce(t102*t56 + weight*(t102 + t64*(t103 + t67 + q1_1*t73 + t101*t75)), axis=-1)
+    H[11] = np.add.reduce(t104*t56 + weight*(t104 + t64*(q1_0*t105 + q1_1*t77 + t101*t81)), axis=-1)
+    H[12] = np.add.reduce(t106*t56 + weight*(t106 + t64*(t80 + q1_1*t105 + q1_1*t83 + t101*t84)), axis=-1)
+    H[13] = np.add.reduce(t107*t56 + weight*(t107 + t64*(t105 + q1_1*t86 + t101*t87)), axis=-1)
+    H[14] = np.add.reduce(t108*t56 + weight*(t108 + t64*(q1_0*t66 + q1_1*t89 + t101*t91)), axis=-1)
+    H[15] = np.add.reduce(t109*t56 + weight*(t109 + t64*(t90 + q1_1*t66 + q1_1*t93 + t101*t94)), axis=-1)
+    H[16] = np.add.reduce(t27*t95 + weight*(t28 + t26*t97), axis=-1)
+    H[17] = np.add.reduce(t110*t56 + weight*(t110 + t64*(t111 + 2.0*t73 + t112*t75)), axis=-1)
+    H[18] = np.add.reduce(t113*t56 + weight*(t113 + t64*(t77 + q1_0*t115 + t112*t81)), axis=-1)
+    H[19] = np.add.reduce(t116*t56 + weight*(t116 + t64*(t83 + q1_1*t115 + t112*t84)), axis=-1)
+    H[20] = np.add.reduce(t117*t56 + weight*(t117 + t64*(t115 + t86 + t112*t87)), axis=-1)
+    H[21] = np.add.reduce(t118*t56 + weight*(t118 + t64*(t89 + q1_0*t114 + t112*t91)), axis=-1)
+    H[22] = np.add.reduce(t119*t56 + weight*(t119 + t64*(t93 + q1_1*t114 + t112*t94)), axis=-1)
+    H[23] = np.add.reduce(t30*t95 + weight*(t31 + t29*t97), axis=-1)
+    H[24] = np.add.reduce(t120*t56 + weight*(t120 + t64*(t122*t59 + t124*t81 + t20*(-t123 - t60))), axis=-1)
+    H[25] = np.add.reduce(t125*t56 + weight*(t125 + t64*(t69 + q1_0*t127 + q1_1*t122 + t124*t84)), axis=-1)
+    H[26] = np.add.reduce(t128*t56 + weight*(t128 + t64*(t122 + t74 + q2_1*t130 + t124*t87)), axis=-1)
+    H[27] = np.add.reduce(t131*t56 + weight*(t131 + t64*(t134 + q1_0*t121 + q1_0*t133 + t124*t91)), axis=-1)
+    H[28] = np.add.reduce(t135*t56 + weight*(t135 + t64*(q1_0*t136 + q1_1*t121 + t124*t94)), axis=-1)
+    H[29] = np.add.reduce(t36*t95 + weight*(t37 + t35*t97), axis=-1)
+    H[30] = np.add.reduce(t137*t56 + weight*(t137 + t64*(t127*t99 + t138*t84 + t20*(-t100 - t123))), axis=-1)
+    H[31] = np.add.reduce(t139*t56 + weight*(t139 + t64*(t103 + t127 + q2_1*t140 + t138*t87)), axis=-1)
+    H[32] = np.add.reduce(t141*t56 + weight*(t141 + t64*(q1_0*t126 + q1_1*t133 + t138*t91)), axis=-1)
+    H[33] = np.add.reduce(t142*t56 + weight*(t142 + t64*(t134 + q1_1*t126 + q1_1*t136 + t138*t94)), axis=-1)
+    H[34] = np.add.reduce(t41*t95 + weight*(t42 + t40*t97), axis=-1)
+    H[35] = np.add.reduce(t143*t56 + weight*(t143 + t64*(t111 + 2.0*q2_1*t129 + t144*t87)), axis=-1)
+    H[36] = np.add.reduce(t145*t56 + weight*(t145 + t64*(t130 + t133 + t144*t91)), axis=-1)
+    H[37] = np.add.reduce(t146*t56 + weight*(t146 + t64*(t136 + t140 + t144*t94)), axis=-1)
+    H[38] = np.add.reduce(t44*t95 + weight*(t45 + t43*t97), axis=-1)
+    H[39] = np.add.reduce(t147*t56 + weight*(t147 + t64*(t111 + 2.0*t148*t46 + t149*t91)), axis=-1)
+    H[40] = np.add.reduce(t150*t56 + weight*(t150 + t64*(t148*t49 + t149*t94 + t151*t46)), axis=-1)
+    H[41] = np.add.reduce(t47*t95 + weight*(t48 + t46*t97), axis=-1)
+    H[42] = np.add.reduce(t152*t56 + weight*(t152 + t64*(t111 + 2.0*t151*t49 + t49*t62*t94)), axis=-1)
+    H[43] = np.add.reduce(t50*t95 + weight*(t51 + t49*t97), axis=-1)
+    H[44] = np.add.reduce(t53 + t55*t96, axis=-1)

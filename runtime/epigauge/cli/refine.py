@@ -85,7 +85,7 @@ def refine(
 
     std_F, std_sigma = standard_deviations(result.F, result.covariance)
     more = {
-        "file": str(matches),
+        "source": str(matches),
         "matches": len(pair),
         "std_F": std_F,
         "std_sigma": std_sigma,
@@ -166,7 +166,7 @@ def _report(result: eg.FundamentalResult, more: dict[str, Any]) -> None:
     if result.rank < 7:
         rows["warning"] = f"the matches determine only {result.rank} of the 7 directions of F"
     out = console()
-    out.print(facts(escape(shown(Path(more["file"]))), rows))
+    out.print(facts(escape(shown(Path(more["source"]))), rows))
     deviations = Table(title="standard deviation of F", show_header=False, title_justify="left")
     for row in more["std_F"]:
         deviations.add_row(*(f"{value:.2e}" for value in row))

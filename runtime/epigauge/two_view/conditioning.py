@@ -48,6 +48,10 @@ class Conditioning:
         """Return conditioned points as pixels, shape (m, 2)."""
         return q1.T * self.scale + self.origin1, q2.T * self.scale + self.origin2
 
+    def maps_from_pixels(self) -> tuple[Array, Array]:
+        """Return the (3, 3) homogeneous maps of both images from pixels."""
+        return self._to_units(self.origin1), self._to_units(self.origin2)
+
     def from_pixels(self, F: Array) -> Array:
         """Return the conditioned F with unit Frobenius norm."""
         conditioned = self._pixels_from(self.origin2).T @ F @ self._pixels_from(self.origin1)

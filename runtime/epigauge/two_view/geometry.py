@@ -9,7 +9,8 @@ from epigauge import kernels
 from epigauge._arguments import as_fundamental, as_matches
 from epigauge.errors import ArgumentError
 from epigauge.two_view.conditioning import Conditioning, condition
-from epigauge.two_view.eliminated import foot_points
+from epigauge.two_view.criteria import Reprojection
+from epigauge.two_view.free import fundamental_from_cameras
 from epigauge.two_view.parameterizations import factorize
 
 __all__ = ["canonical_cameras", "reprojection_distances", "sampson_distances", "triangulate"]
@@ -85,10 +86,10 @@ def reprojection_distances(
     if not len(x1):
         return np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2))
     frame, F_inside, q1, q2 = _conditioned(F, x1, x2)
-    table = kernels.table()
-    feet = foot_points(table, F_inside, q1, q2)
-    q1_hat, q2_hat, _ = table.foot_point_derivative(*feet.frame, q1, q2, feet.multiplier)
-    return (feet.d * frame.scale, *frame.backward(q1_hat, q2_hat))
+    reprojection = Reprojection(kernels.table(), q1, q2)
+    feet = reprojection.evaluate(F_inside)
+    q1_hat, q2_hat, _ = reprojection.corrected(feet)
+    return (feet.signed * frame.scale, *frame.backward(q1_hat, q2_hat))
 
 
 def sampson_distances(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> Array:
@@ -167,18 +168,10 @@ def triangulate(P: ArrayLike, x: ArrayLike) -> Array:
     return np.asarray(np.where(Q[:, 3:] < 0.0, -Q, Q))
 
 
-def _fundamental(P: Array) -> Array:
-    """Return F of two cameras: entry (i, j) is the determinant without rows i and j."""
-    others = ([1, 2], [2, 0], [0, 1])
-    P = P / np.linalg.norm(P, axis=(1, 2), keepdims=True)
-    F = np.array(
-        [
-            [np.linalg.det(np.vstack([P[0][others[j]], P[1][others[i]]])) for j in range(3)]
-            for i in range(3)
-        ]
-    )
-    values = np.linalg.svd(F, compute_uv=False)
-    if values[1] <= 1e-13:
+def _fundamental(cameras: Array) -> Array:
+    """Return F of two cameras, refusing those that did not move."""
+    F = fundamental_from_cameras(cameras)
+    if np.linalg.svd(F, compute_uv=False)[1] <= 1e-13:
         raise ArgumentError("P", "has two cameras with the same centre", "cameras that moved")
     return F
 

@@ -1,4 +1,4 @@
-"""Bundle adjustment of B&S Table 1: F and one point a match, sparse normal equations.
+"""Bundle adjustment of B&S Table 1: motion and one point a match, sparse normal equations.
 
 Camera P = (I | 0), camera P' from the parameterisation, points (a, b, 1, c).
 """
@@ -6,19 +6,39 @@ Camera P = (I | 0), camera P' from the parameterisation, points (a, b, 1, c).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.kernels import Table
 from epigauge.linear import Arrow
-from epigauge.two_view.eliminated import foot_points
-from epigauge.two_view.parameterizations import Ortho
+from epigauge.two_view.criteria import Reprojection
+from epigauge.two_view.losses import Loss
 
-__all__ = ["JointProblem", "JointState", "intersect"]
+__all__ = ["CanonicMotion", "JointProblem", "JointState", "intersect"]
 
 Array = NDArray[np.float64]
+
+
+class CanonicMotion(Protocol):
+    """What the joint problem needs of a parameterisation."""
+
+    @property
+    def dimension(self) -> int:
+        """Return the number of motion parameters."""
+
+    def start(self, F: Array) -> Any:
+        """Return the representation of a start value."""
+
+    def fundamental(self, estimate: Any) -> Array:
+        """Return F."""
+
+    def camera(self, estimate: Any) -> tuple[Array, Array]:
+        """Return P' and its derivative by the motion parameters."""
+
+    def retract(self, estimate: Any, delta: Array) -> Any:
+        """Return the moved estimate."""
 
 
 def intersect(P2: Array, q1_hat: Array, q2_hat: Array) -> Array:
@@ -45,69 +65,87 @@ def intersect(P2: Array, q1_hat: Array, q2_hat: Array) -> Array:
     return np.concatenate([q1_hat, c[None]])
 
 
+def first_structure(kernels: Table, F: Array, P2: Array, q1: Array, q2: Array) -> Array:
+    """Return the points of smallest reprojection error, (3, m), as B&S start with."""
+    criterion = Reprojection(kernels, q1, q2)
+    q1_hat, q2_hat, _ = criterion.corrected(criterion.evaluate(F))
+    return intersect(P2, q1_hat, q2_hat)
+
+
+def reweighted(r: Array, weights: Array, loss: Loss) -> tuple[float, Array]:
+    """Return the robust cost of residuals (k, m), and the root of each match's weight."""
+    rho, first, _ = loss(np.sum(r**2, axis=0))
+    cost = 0.5 * float(np.sum(weights * rho))
+    return cost if np.isfinite(cost) else float("inf"), np.sqrt(weights * first)
+
+
 @dataclass(frozen=True)
 class JointState:
-    """Motion and structure, residuals with their Jacobian blocks, and cost."""
+    """Motion and structure, residuals with their Jacobian blocks, root weights and cost."""
 
     motion: Any
     S: Array
-    A_perp: Array
+    camera_derivative: Array
     r: Array
     J_S: Array
     J_P2: Array
+    root: Array
     cost: float
 
 
 class JointProblem:
-    """Sum of weighted squared residuals as a function of F and the points.
+    """Robust weighted sum of squared residuals as a function of motion and structure.
 
     Parameters
     ----------
     kernels : Table
         Backend.
-    parameterization : Ortho
-        Represents F and gives the second camera.
+    parameterization : CanonicMotion
+        Gives the second camera.
     q1, q2 : ndarray, shape (2, m)
         Conditioned matches.
     weights : ndarray, shape (m,)
-        Factor of the squared residuals of each match.
+        Factor of the cost of each match.
+    loss : Loss
+        Applied to the squared residual of each match.
     """
 
     def __init__(
-        self, kernels: Table, parameterization: Ortho, q1: Array, q2: Array, weights: Array
+        self,
+        kernels: Table,
+        parameterization: CanonicMotion,
+        q1: Array,
+        q2: Array,
+        weights: Array,
+        loss: Loss,
     ) -> None:
         self.kernels = kernels
         self.parameterization = parameterization
-        self.q1, self.q2, self.weights = q1, q2, weights
+        self.q1, self.q2 = q1, q2
+        self.weights, self.loss = weights, loss
         self.floor = 0.5 * float(np.sum(weights)) * 1e-30
 
     def start(self, F: Array) -> tuple[Any, Array]:
         """Return motion and structure of a start value, each point at its foot point."""
         motion = self.parameterization.start(F)
-        F = self.parameterization.fundamental(motion)
-        feet = foot_points(self.kernels, F, self.q1, self.q2)
-        matches = (self.q1, self.q2, feet.multiplier)
-        q1_hat, q2_hat, _ = self.kernels.foot_point_derivative(*feet.frame, *matches)
-        P2, _ = self.parameterization.camera(motion)
-        return motion, intersect(P2, q1_hat, q2_hat)
+        F, (P2, _) = self.parameterization.fundamental(motion), self.parameterization.camera(motion)
+        return motion, first_structure(self.kernels, F, P2, self.q1, self.q2)
 
     def evaluate(self, estimate: tuple[Any, Array]) -> JointState:
         """Return the state of motion and structure."""
         motion, S = estimate
-        P2, A_perp = self.parameterization.camera(motion)
+        P2, derivative = self.parameterization.camera(motion)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             # A point may step through the focal plane: the trial is then rejected by its cost.
             r, J_S, J_P2 = self.kernels.two_view_structure(P2, S, self.q1, self.q2)
-            cost = 0.5 * float(np.sum(self.weights * r**2))
-        cost = cost if np.isfinite(cost) else float("inf")
-        return JointState(motion, S, A_perp, r, J_S, J_P2, cost)
+            cost, root = reweighted(r, self.weights, self.loss)
+        return JointState(motion, S, derivative, r, J_S, J_P2, root, cost)
 
     def linearize(self, state: JointState) -> Arrow:
         """Return the normal equations, blocks (iii') to (v) of the algorithm."""
-        root = np.sqrt(self.weights)
-        r, J_S = root * state.r, root * state.J_S
-        A = root * np.tensordot(state.A_perp, state.J_P2, axes=(0, 1))
-        p, m = A.shape[0], A.shape[2]
+        r, J_S = state.root * state.r, state.root * state.J_S
+        A = state.root * np.tensordot(state.camera_derivative, state.J_P2, axes=(0, 1))
+        p, _, m = A.shape
         flat = A.reshape(p, 2 * m)
         return Arrow(
             U=flat @ flat.T,
@@ -122,3 +160,7 @@ class JointProblem:
         p = self.parameterization.dimension
         motion = self.parameterization.retract(state.motion, step[:p])
         return motion, state.S + step[p:].reshape(-1, 3).T
+
+    def fundamental(self, state: JointState) -> Array:
+        """Return F of a state."""
+        return self.parameterization.fundamental(state.motion)

@@ -1,20 +1,59 @@
 """Ways to represent and update a fundamental matrix during the optimisation.
 
-Each offers the same few methods, so that the problems know nothing of the representation.
+Each offers the same few methods, so that the problems know nothing of the representation: `start`,
+`fundamental`, `retract`, and derivatives of F (`derivatives`) and of the second camera (`camera`)
+by the update parameters, at no update.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.kernels import Table
 
-__all__ = ["PARAMETERIZATIONS", "Ortho", "OrthonormalF", "factorize"]
+__all__ = [
+    "PARAMETERIZATIONS",
+    "Block",
+    "BlockF",
+    "Maps",
+    "MapsF",
+    "Ortho",
+    "OrthonormalF",
+    "ParFree",
+    "Parameterization",
+    "Reduced",
+    "Remapped",
+    "factorize",
+    "frozen_directions",
+]
 
 Array = NDArray[np.float64]
+
+
+class Parameterization(Protocol):
+    """A representation of F with p update parameters."""
+
+    @property
+    def dimension(self) -> int:
+        """Return p."""
+
+    def start(self, F: Array) -> Any:
+        """Return the representation of the rank-2 matrix nearest to F."""
+
+    def fundamental(self, estimate: Any) -> Array:
+        """Return F, of any scale."""
+
+    def derivatives(self, estimate: Any) -> tuple[Array, Array]:
+        """Return first (9, p) and second (9, p, p) derivatives of vect(F) at no update."""
+
+    def camera(self, estimate: Any) -> tuple[Array, Array]:
+        """Return P' for P = (I | 0), and its derivative (12, p) at no update."""
+
+    def retract(self, estimate: Any, delta: Array) -> Any:
+        """Return the estimate moved by p parameters."""
 
 
 class OrthonormalF(NamedTuple):
@@ -54,32 +93,277 @@ class Ortho:
     """Seven parameters: U <- U R(x), V <- V R(y), sigma <- sigma + delta_sigma (B&S eq. 3)."""
 
     dimension = 7
+    #: Parameters that move each part of the epipolar geometry (B&S section 4.4).
+    parts = {"epipole2": (0, 1), "epipole1": (3, 4), "epipolar_transformation": (2, 5, 6)}
 
-    def __init__(self, kernels: Table) -> None:
+    def __init__(self, kernels: Table, essential: bool = False) -> None:
         self._kernels = kernels
+        self._essential = essential
+
+    @classmethod
+    def essential(cls, kernels: Table) -> Reduced:
+        """Return the five parameters of an essential matrix: sigma = 1, no null direction.
+
+        At sigma = 1 the update x3 = y3 = t leaves F as it is (B&S section 4.3).
+        """
+        basis = np.zeros((7, 5))
+        basis[[0, 1, 3, 4], [0, 1, 2, 3]] = 1.0
+        basis[[2, 5], 4] = np.sqrt(0.5), -np.sqrt(0.5)
+        return Reduced(cls(kernels, essential=True), basis)
 
     def start(self, F: Array) -> OrthonormalF:
-        """Return the representation of a start value."""
-        return factorize(F)
+        """Return the orthonormal representation."""
+        U, V, sigma = factorize(F)
+        return OrthonormalF(U, V, np.ones_like(sigma) if self._essential else sigma)
 
     def fundamental(self, estimate: OrthonormalF) -> Array:
         """Return F (B&S eq. 2)."""
         return np.asarray(self._kernels.fundamental_from_factors(*estimate))
 
     def derivatives(self, estimate: OrthonormalF) -> tuple[Array, Array]:
-        """Return dF, shape (9, 7), and d2F, shape (9, 7, 7), by the update at no update."""
+        """Return the derivatives of F."""
         _, first, second = self._kernels.fundamental_derivatives(*estimate)
         return first, second
 
     def camera(self, estimate: OrthonormalF) -> tuple[Array, Array]:
-        """Return P' (B&S eq. 5) and A_perp, shape (12, 7) (B&S eqs. 6, 7)."""
+        """Return P' (B&S eq. 5) and A_perp (B&S eqs. 6, 7)."""
         P2, A_perp = self._kernels.canonical_camera_derivatives(*estimate)
         return P2, A_perp
 
     def retract(self, estimate: OrthonormalF, delta: Array) -> OrthonormalF:
-        """Return the estimate moved by seven parameters."""
+        """Return the updated factors."""
         return OrthonormalF(*self._kernels.retract_factors(*estimate, delta))
 
 
-#: The parameterisations by name.
-PARAMETERIZATIONS = {"ortho": Ortho}
+class BlockF(NamedTuple):
+    """F = U12 M V12^T: first two columns of orthonormal U, V, and a 2x2 matrix of unit norm."""
+
+    U: Array
+    V: Array
+    M: Array
+
+
+class Block:
+    """Seven parameters, regular at sigma = 1: the epipoles by rotations, M in its tangent plane."""
+
+    dimension = 7
+    parts = {"epipole2": (0, 1), "epipole1": (2, 3), "epipolar_transformation": (4, 5, 6)}
+
+    def __init__(self, kernels: Table) -> None:
+        self._kernels = kernels
+
+    def start(self, F: Array) -> BlockF:
+        """Return the block representation."""
+        U, V, sigma = factorize(F)
+        return BlockF(U, V, np.diag([1.0, float(sigma)]) / np.hypot(1.0, sigma))
+
+    def fundamental(self, estimate: BlockF) -> Array:
+        """Return F."""
+        U, V, M = estimate
+        return np.asarray(U[:, :2] @ M @ V[:, :2].T)
+
+    def derivatives(self, estimate: BlockF) -> tuple[Array, Array]:
+        """Return the derivatives of F."""
+        _, first, second = self._kernels.block_derivatives(*estimate)
+        return first, second
+
+    def camera(self, estimate: BlockF) -> tuple[Array, Array]:
+        """Return the canonic P' and its derivative."""
+        P2, derivative = self._kernels.block_camera_derivatives(*estimate)
+        return P2, derivative
+
+    def retract(self, estimate: BlockF, delta: Array) -> BlockF:
+        """Return the updated factors."""
+        return BlockF(*self._kernels.block_retract(*estimate, delta))
+
+
+class MapsF(NamedTuple):
+    """Epipoles and epipolar transformation in one of 36 charts.
+
+    Attributes
+    ----------
+    chart : str
+        Which entries of e, e' and of the transformation are frozen to one.
+    parameters : ndarray, shape (7,)
+        The others.
+    """
+
+    chart: str
+    parameters: Array
+
+
+class Maps:
+    """Seven parameters in the best of 36 charts, chosen anew after every update (B&S section 2)."""
+
+    dimension = 7
+
+    def __init__(self, kernels: Table) -> None:
+        self._kernels = kernels
+
+    def start(self, F: Array) -> MapsF:
+        """Return the chart that freezes the largest entries, and the parameters in it."""
+        U, _, V = np.linalg.svd(F)
+        e, e_ = V[2], U[:, 2]
+        i, j = int(np.argmax(np.abs(e))), int(np.argmax(np.abs(e_)))
+        inner = np.delete(np.delete(F, j, axis=0), i, axis=1).ravel()
+        k = int(np.argmax(np.abs(inner)))
+        free = (np.delete(e / e[i], i), np.delete(e_ / e_[j], j), np.delete(inner / inner[k], k))
+        return MapsF(f"maps_{i}{j}{k}", np.concatenate(free))
+
+    def fundamental(self, estimate: MapsF) -> Array:
+        """Return F."""
+        return self._all(estimate)[0]
+
+    def derivatives(self, estimate: MapsF) -> tuple[Array, Array]:
+        """Return the derivatives of F."""
+        _, first, second, _, _ = self._all(estimate)
+        return first, second
+
+    def camera(self, estimate: MapsF) -> tuple[Array, Array]:
+        """Return the canonic P' and its derivative."""
+        _, _, _, P2, derivative = self._all(estimate)
+        return P2, derivative
+
+    def retract(self, estimate: MapsF, delta: Array) -> MapsF:
+        """Return the updated matrix in the chart that suits it best."""
+        return self.start(self.fundamental(MapsF(estimate.chart, estimate.parameters + delta)))
+
+    def _all(self, estimate: MapsF) -> tuple[Array, Array, Array, Array, Array]:
+        F, dF, d2F, P2, dP2 = getattr(self._kernels, estimate.chart)(estimate.parameters)
+        return F, dF, d2F, P2, dP2
+
+
+class ParFree:
+    """The twelve entries of P' with P = (I | 0): five more than needed (B&S section 5)."""
+
+    dimension = 12
+
+    def __init__(self, kernels: Table) -> None:
+        self._kernels = kernels
+
+    def start(self, F: Array) -> Array:
+        """Return the canonic P' of F."""
+        return np.asarray(self._kernels.canonical_camera(*factorize(F)))
+
+    def fundamental(self, estimate: Array) -> Array:
+        """Return [p4]_x H for P' = (H | p4)."""
+        return np.cross(estimate[:, 3], estimate[:, :3], axisb=0, axisc=0)
+
+    def camera(self, estimate: Array) -> tuple[Array, Array]:
+        """Return P' itself."""
+        return estimate, np.eye(12)
+
+    def retract(self, estimate: Array, delta: Array) -> Array:
+        """Return the sum."""
+        return estimate + delta.reshape(3, 4)
+
+
+class Reduced:
+    """A parameterisation restricted to some directions of its update.
+
+    Parameters
+    ----------
+    inner : Parameterization
+        Whose parameters are restricted.
+    basis : ndarray, shape (p, k)
+        Columns are the k directions left; a row of zeros freezes a parameter exactly.
+    """
+
+    def __init__(self, inner: Parameterization, basis: Array) -> None:
+        self._inner, self._basis = inner, basis
+        self.dimension = basis.shape[1]
+
+    def start(self, F: Array) -> Any:
+        """Return the inner representation."""
+        return self._inner.start(F)
+
+    def fundamental(self, estimate: Any) -> Array:
+        """Return F."""
+        return self._inner.fundamental(estimate)
+
+    def derivatives(self, estimate: Any) -> tuple[Array, Array]:
+        """Return derivatives by the directions left."""
+        first, second = self._inner.derivatives(estimate)
+        return first @ self._basis, self._basis.T @ second @ self._basis
+
+    def camera(self, estimate: Any) -> tuple[Array, Array]:
+        """Return P' and its derivative by the directions left."""
+        P2, derivative = self._inner.camera(estimate)
+        return P2, derivative @ self._basis
+
+    def retract(self, estimate: Any, delta: Array) -> Any:
+        """Return the estimate moved along the directions left."""
+        return self._inner.retract(estimate, self._basis @ delta)
+
+
+class Remapped:
+    """A parameterisation of F in other image coordinates than those that are computed in.
+
+    Freezing a part of F, or sigma = 1, means something in given coordinates only: the caller's
+    pixels, or those of calibrated cameras.
+
+    Parameters
+    ----------
+    inner : Parameterization
+        Of F in its own coordinates.
+    to1, to2 : ndarray, shape (3, 3)
+        Homogeneous maps of the images from its coordinates to those computed in.
+    """
+
+    def __init__(self, inner: Parameterization, to1: Array, to2: Array) -> None:
+        self._inner = inner
+        self._to1, self._to2 = to1, to2
+        self._from1 = np.linalg.inv(to1)
+        self._entries = np.kron(np.linalg.inv(to2).T, self._from1.T)
+        self.dimension = inner.dimension
+
+    def start(self, F: Array) -> Any:
+        """Return the inner representation."""
+        return self._inner.start(self._to2.T @ F @ self._to1)
+
+    def fundamental(self, estimate: Any) -> Array:
+        """Return F in the coordinates computed in."""
+        return (self._entries @ self._inner.fundamental(estimate).ravel()).reshape(3, 3)
+
+    def derivatives(self, estimate: Any) -> tuple[Array, Array]:
+        """Return derivatives of F in the coordinates computed in."""
+        first, second = self._inner.derivatives(estimate)
+        return self._entries @ first, np.tensordot(self._entries, second, axes=1)
+
+    def camera(self, estimate: Any) -> tuple[Array, Array]:
+        """Return P' for P = (I | 0) in the coordinates computed in."""
+        P2, derivative = self._inner.camera(estimate)
+        back = np.eye(4)
+        back[:3, :3] = self._from1
+        return self._to2 @ P2 @ back, np.kron(self._to2, back.T) @ derivative
+
+    def retract(self, estimate: Any, delta: Array) -> Any:
+        """Return the estimate moved by the inner update."""
+        return self._inner.retract(estimate, delta)
+
+
+def frozen_directions(parts: dict[str, tuple[int, ...]], fix: tuple[str, ...]) -> Array:
+    """Return the basis for `Reduced` that freezes parts of the epipolar geometry.
+
+    Parameters
+    ----------
+    parts : dict
+        Parameters of each part, as `Ortho.parts`.
+    fix : tuple of str
+        Parts to freeze.
+
+    Returns
+    -------
+    ndarray, shape (7, k)
+        Unit vectors of the parameters left.
+    """
+    frozen = {index for part in fix for index in parts[part]}
+    return np.eye(7)[:, [k for k in range(7) if k not in frozen]]
+
+
+#: The minimal parameterisations by name: of F alone, for any structure.
+PARAMETERIZATIONS: dict[str, type[Ortho] | type[Block] | type[Maps]] = {
+    "ortho": Ortho,
+    "block": Block,
+    "maps": Maps,
+}

@@ -2,40 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels, lm
 from epigauge._arguments import (
+    as_calibration,
     as_choice,
     as_fundamental,
     as_matches,
     as_positive,
     as_weights,
+    check_general_position,
 )
 from epigauge.errors import ArgumentError
-from epigauge.linear import Levenberg, Seber
-from epigauge.two_view.conditioning import Conditioning, condition, displaced
+from epigauge.two_view.conditioning import condition
 from epigauge.two_view.covariance import fundamental_covariance
-from epigauge.two_view.eliminated import EliminatedProblem, foot_points
+from epigauge.two_view.criteria import CRITERIA, Reprojection
 from epigauge.two_view.geometry import canonical_cameras
 from epigauge.two_view.initial import fundamental_8point
-from epigauge.two_view.joint import JointProblem, intersect
+from epigauge.two_view.joint import intersect
+from epigauge.two_view.losses import LOSSES
 from epigauge.two_view.parameterizations import PARAMETERIZATIONS, Ortho, factorize
 from epigauge.two_view.result import FundamentalResult
+from epigauge.two_view.solve import DAMPINGS, REDUNDANT, Matches, Options, Solution, minimize
 
 __all__ = ["refine_fundamental"]
 
 Array = NDArray[np.float64]
-
-_DAMPINGS: dict[str, type[Levenberg] | type[Seber]] = {"levenberg": Levenberg, "seber": Seber}
-_STRUCTURES = ("eliminated", "joint")
-_HESSIANS = ("exact", "gauss-newton")
-_CRITERIA = ("reprojection",)
 
 
 def refine_fundamental(
@@ -48,6 +44,12 @@ def refine_fundamental(
     structure: str = "eliminated",
     damping: str = "levenberg",
     hessian: str = "exact",
+    fix: str | Sequence[str] = (),
+    essential: bool = False,
+    K1: ArrayLike | None = None,
+    K2: ArrayLike | None = None,
+    loss: str = "linear",
+    loss_scale_px: float | str = "auto",
     noise_px: float | None = 1.0,
     weights: ArrayLike | None = None,
     ftol: float = 1e-10,
@@ -68,10 +70,13 @@ def refine_fundamental(
         At least eight matches in pixels without gross errors; also (m, 1, 2), any real type.
     F0 : array_like, shape (3, 3), optional
         Start value with ``x2^T F0 x1 = 0``, of any scale; by default `fundamental_8point`.
-    parameterization : {"ortho"}
-        How F is represented: "ortho" is the 7-parameter orthonormal representation of B&S.
-    criterion : {"reprojection"}
-        What is minimised: the exact reprojection error.
+    parameterization : {"ortho", "block", "maps", "parfree", "free", "normalized"}
+        How F is represented: the orthonormal representation of B&S, a chart regular at sigma = 1,
+        or the best of 36 minimal maps; the last three optimise cameras, with 12 and 24 parameters,
+        and are solved jointly with the points whatever `structure` says.
+    criterion : {"reprojection", "sampson", "epipolar"}
+        What is minimised: the exact reprojection error, its first-order approximation, or the
+        squared distances of both points to their epipolar lines.
     structure : {"eliminated", "joint"}
         "eliminated" optimises over F alone, each match being at its exact foot point; "joint"
         optimises F and one point a match (B&S Table 1).
@@ -79,9 +84,23 @@ def refine_fundamental(
         lambda I, or lambda diag(J^T J).
     hessian : {"exact", "gauss-newton"}
         Second derivatives for the eliminated structure; "joint" always uses Gauss-Newton.
+    fix : str or sequence of str
+        Parts of the start value to leave exactly as they are (B&S section 4.4): "epipole1",
+        "epipole2", "epipolar_transformation", in the coordinates of the images.
+    essential : bool
+        Keep F the image of an essential matrix, sigma = 1 in calibrated coordinates: five
+        parameters. The result then has E, R and t.
+    K1, K2 : array_like, shape (3, 3), optional
+        Calibration matrices for `essential`; the identity by default (coordinates on the retina),
+        and K1 for both where only it is given.
+    loss : {"linear", "huber", "soft_l1", "cauchy", "truncated"}
+        Robust loss of each match's squared distance, defined as in SciPy.
+    loss_scale_px : float or "auto"
+        Scale of the loss in pixels; by default a multiple of the noise as estimated from the
+        residuals, anew until it stands still.
     noise_px : float or None
         Standard deviation of a coordinate in pixels, which scales the covariance only; None
-        estimates it from the residuals, as sqrt(2 cost / (m - 7)).
+        estimates it from the residuals, as sqrt(2 cost / (m - 7)), m the matches of weight above 0.
     weights : array_like, shape (m,), optional
         Factor of each match's squared distance.
     ftol, xtol, gtol : float
@@ -120,51 +139,80 @@ def refine_fundamental(
        parameters", PAMI 26(3), 2004.
     """
     x1, x2 = as_matches(x1, x2, general_position=True)
-    as_choice("criterion", criterion, _CRITERIA)
-    as_choice("structure", structure, _STRUCTURES)
-    as_choice("hessian", hessian, _HESSIANS)
-    as_choice("parameterization", parameterization, PARAMETERIZATIONS)
-    as_choice("damping", damping, _DAMPINGS)
+    options = Options(
+        parameterization=as_choice(
+            "parameterization", parameterization, (*PARAMETERIZATIONS, *REDUNDANT)
+        ),
+        criterion=as_choice("criterion", criterion, CRITERIA),
+        structure=as_choice("structure", structure, ("eliminated", "joint")),
+        damping=as_choice("damping", damping, DAMPINGS),
+        hessian=as_choice("hessian", hessian, ("exact", "gauss-newton")),
+        fix=tuple(
+            as_choice("fix", p, Ortho.parts) for p in ([fix] if isinstance(fix, str) else fix)
+        ),
+        calibration=_calibration(essential, K1, K2),
+        loss=as_choice("loss", loss, LOSSES),
+        loss_scale_px=None
+        if loss_scale_px == "auto"
+        else as_positive("loss_scale_px", loss_scale_px),
+        stopping=lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter),
+    )
+    _check_combination(options)
     if noise_px is not None:
         noise_px = as_positive("noise_px", noise_px)
-    stopping = lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter)
     w = np.ones(len(x1)) if weights is None else as_weights(weights, len(x1))
-    start = as_fundamental(_start(x1, x2, w) if F0 is None else F0)
-    setup = _Setup.of(x1, x2, w, start, kernels.table(backend))
-    chart = PARAMETERIZATIONS[parameterization](setup.table)
-    problem: JointProblem | EliminatedProblem
-    if structure == "joint":
-        problem = JointProblem(setup.table, chart, setup.q1, setup.q2, w)
-    else:
-        exact = hessian == "exact"
-        problem = EliminatedProblem(setup.table, chart, setup.q1, setup.q2, w, exact)
-    outcome: lm.Outcome[Any] = lm.minimize(
-        problem,
-        problem.start(setup.frame.from_pixels(start)),
-        _DAMPINGS[damping](),
-        lm.Classic(),
-        stopping,
-        callback,
-        setup.frame.scale**2,
-    )
-    return _result(outcome, chart, setup, noise_px)
+    start = _start(x1, x2, w) if F0 is None else _given_start(F0, x1, x2, w)
+    matches = Matches.of(x1, x2, w, start, kernels.table(backend))
+    solution = minimize(matches, options, matches.frame.from_pixels(start), callback)
+    return _result(solution, options, matches, noise_px)
 
 
-@dataclass(frozen=True)
-class _Setup:
-    """The matches in the coordinates that are computed in."""
+def _calibration(
+    essential: bool, K1: ArrayLike | None, K2: ArrayLike | None
+) -> tuple[Array, Array] | None:
+    """Return both calibration matrices, or None where F is not restricted."""
+    if not essential:
+        if K1 is not None or K2 is not None:
+            raise ArgumentError("K1, K2", "are given", "essential=True as well, or neither")
+        return None
+    first = np.eye(3) if K1 is None else as_calibration("K1", K1)
+    return first, first if K2 is None else as_calibration("K2", K2)
 
-    table: kernels.Table
-    frame: Conditioning
-    q1: Array
-    q2: Array
-    weights: Array
 
-    @staticmethod
-    def of(x1: Array, x2: Array, weights: Array, F: Array, table: kernels.Table) -> _Setup:
-        frame = condition(x1, x2)
-        frame = displaced(frame, frame.from_pixels(F))
-        return _Setup(table, frame, *frame.forward(x1, x2), weights)
+def _check_combination(options: Options) -> None:
+    """Refuse what is not defined."""
+    restricted = "fix" if options.fix else "essential" if options.calibration is not None else ""
+    if options.fix and options.calibration is not None:
+        raise ArgumentError("fix", "is combined with essential=True", "one of the two")
+    if restricted and options.parameterization not in ("ortho", "block"):
+        raise ArgumentError(
+            "parameterization",
+            f"is {options.parameterization!r} with {restricted}",
+            "'ortho' or 'block', whose parameters keep the parts of F separate",
+        )
+    if len(set(options.fix)) == len(Ortho.parts):
+        raise ArgumentError("fix", "names every part of F", "something left to refine")
+    joint = options.structure == "joint" or options.parameterization in REDUNDANT
+    if joint and options.criterion != "reprojection":
+        raise ArgumentError(
+            "criterion",
+            f"is {options.criterion!r} with points as unknowns",
+            "'reprojection', or structure='eliminated' with a minimal parameterization",
+        )
+
+
+def _given_start(F0: ArrayLike, x1: Array, x2: Array, weights: Array) -> Array:
+    """Check the caller's start value, in coordinates where its rank can be told."""
+    F = as_fundamental(F0)
+    # Divided by a power of two, which is exact, so that no square overflows or vanishes
+    F = np.ldexp(F, -int(np.frexp(np.max(np.abs(F)))[1]))
+    for name, x in (("x1", x1), ("x2", x2)):
+        check_general_position(name, x[weights > 0.0])
+    counts = weights > 0.0
+    values = np.linalg.svd(condition(x1[counts], x2[counts]).from_pixels(F), compute_uv=False)
+    if values[1] <= 16.0 * np.finfo(float).eps * values[0]:
+        raise ArgumentError("F0", "has rank 1", "a fundamental matrix, of rank 2")
+    return np.asarray(F)
 
 
 def _start(x1: Array, x2: Array, weights: Array) -> Array:
@@ -176,35 +224,37 @@ def _start(x1: Array, x2: Array, weights: Array) -> Array:
 
 
 def _result(
-    outcome: lm.Outcome[Any], chart: Ortho, setup: _Setup, noise_px: float | None
+    solution: Solution, options: Options, matches: Matches, noise_px: float | None
 ) -> FundamentalResult:
-    """Bring the outcome back to pixels and add what follows from it."""
-    motion, frame, weights = outcome.state.motion, setup.frame, setup.weights
-    F_inside = chart.fundamental(motion)
-    norm = float(np.linalg.norm(F_inside))
-    feet = foot_points(setup.table, F_inside, setup.q1, setup.q2)
-    matches = (setup.q1, setup.q2, feet.multiplier)
-    q1_hat, q2_hat, derivative = setup.table.foot_point_derivative(*feet.frame, *matches)
+    """Bring the solution back to pixels and add what follows from it."""
+    frame, weights, outcome = matches.frame, matches.weights, solution.outcome
+    reprojection = Reprojection(matches.table, matches.q1, matches.q2)
+    feet = reprojection.evaluate(solution.F)
+    q1_hat, q2_hat, _ = reprojection.corrected(feet)
     x1_hat, x2_hat = frame.backward(q1_hat, q2_hat)
-    F = frame.to_pixels(F_inside)
+    F = frame.to_pixels(solution.F)
     P1, P2 = canonical_cameras(F)
     abc = intersect(P2, np.ascontiguousarray(x1_hat.T), np.ascontiguousarray(x2_hat.T))
+    points = np.stack([abc[0], abc[1], np.ones(abc.shape[1]), abc[2]], axis=1)
+    criterion = CRITERIA[options.criterion](matches.table, matches.q1, matches.q2)
+    distances = criterion.evaluate(solution.F)
+    by_entries = criterion.derivative(solution.F, distances)
+    loss = options.scaled_loss(solution.loss_scale_px / frame.scale)
+    weight = weights * loss(distances.squared)[1]
     cost = outcome.state.cost * frame.scale**2
-    count = len(weights)
     if noise_px is None:
-        noise_px = float(np.sqrt(2.0 * cost / max(count - 7, 1)))
-    # Derivatives are by F of the norm it has inside; those by the unit-norm F are `norm` times as
-    # large.
-    by_entries = norm * derivative
+        noise_px = float(np.sqrt(2.0 * cost / max(np.count_nonzero(weights) - 7, 1)))
+    # The derivatives are by F of the norm it has inside; those by F of unit norm are so much larger.
+    norm = float(np.linalg.norm(solution.F))
     uncertainty = fundamental_covariance(
-        F_inside / norm,
-        (by_entries * weights) @ by_entries.T,
+        solution.F / norm,
+        norm**2 * (by_entries.T * weight) @ by_entries,
         (noise_px / frame.scale) ** 2,
         frame.entry_map(),
     )
-    jac = frame.scale * derivative.T @ chart.derivatives(motion)[0]
-    fun = frame.scale * feet.d
-    grad = jac.T @ (weights * fun)
+    jac = frame.scale * by_entries @ solution.chart.derivatives(solution.motion)[0]
+    fun = frame.scale * distances.signed
+    grad = jac.T @ (weight * fun)
     factors = factorize(F)
     return FundamentalResult(
         F=F,
@@ -213,12 +263,13 @@ def _result(
         sigma=float(factors.sigma),
         P1=P1,
         P2=P2,
-        points=np.stack([abc[0], abc[1], np.ones(count), abc[2]], axis=1),
+        points=points / np.linalg.norm(points, axis=1, keepdims=True),
         covariance=uncertainty.covariance,
         rank=uncertainty.rank,
         condition=uncertainty.condition,
         noise_px=noise_px,
-        rms_px=float(np.sqrt(np.sum(fun**2) / (4 * count))),
+        rms_px=float(frame.scale * np.sqrt(np.mean(feet.squared) / 4.0)),
+        loss_scale_px=solution.loss_scale_px,
         x=F.ravel(),
         cost=cost,
         fun=fun,

@@ -40,13 +40,15 @@ class FundamentalResult:
     noise_px : float
         Standard deviation of a coordinate that the covariance was computed with.
     rms_px : float
-        sqrt(sum of squared residual coordinates / (4 m)).
+        sqrt(sum of squared residual coordinates / (4 m)), whatever criterion and loss.
+    loss_scale_px : float
+        Scale of the robust loss, given or estimated; 0 for the linear loss.
     x : ndarray, shape (9,)
         vect(F).
     cost : float
-        0.5 * sum of (weighted) squared residuals, in px^2.
+        0.5 * sum of (weighted) squared residuals, in px^2; of rho of them with a robust loss.
     fun : ndarray, shape (m,)
-        Signed reprojection distance of each match.
+        Signed distance of each match in the sense of the criterion.
     jac : ndarray, shape (m, p)
         Derivatives of `fun` by the p update parameters of the parameterisation, at the solution.
     grad : ndarray, shape (p,)
@@ -77,6 +79,7 @@ class FundamentalResult:
     condition: float
     noise_px: float
     rms_px: float
+    loss_scale_px: float
     x: Array = field(repr=False)
     cost: float
     fun: Array = field(repr=False)

@@ -1,0 +1,172 @@
+"""FREE and NORMALIZED of B&S section 5: both cameras and homogeneous points, all entries free."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.kernels import Table
+from epigauge.linear import Arrow
+from epigauge.two_view.joint import first_structure, reweighted
+from epigauge.two_view.losses import Loss
+from epigauge.two_view.parameterizations import factorize
+
+__all__ = ["FreeProblem", "FreeState", "fundamental_from_cameras", "normalized_basis"]
+
+Array = NDArray[np.float64]
+Estimate = tuple[Array, Array]  # cameras (2, 3, 4) and points (4, m)
+
+_OTHERS = ([1, 2], [2, 0], [0, 1])
+
+
+def fundamental_from_cameras(cameras: Array) -> Array:
+    """Return F of two cameras: entry (i, j) is a determinant without row j of P, row i of P'."""
+    first, second = cameras / np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
+    blocks = [
+        [np.vstack([first[_OTHERS[j]], second[_OTHERS[i]]]) for j in range(3)] for i in range(3)
+    ]
+    return np.asarray(np.linalg.det(np.array(blocks)))
+
+
+def normalized_basis(cameras: Array, Q: Array) -> Estimate:
+    """Move a reconstruction to the normalised basis: unit norms and sum Q Q^T = (m / 4) I.
+
+    The fixed point of Q <- (sum Q Q^T / Q^T Q)^(-1/2) Q, Tyler's scatter iteration, leaves an
+    orthonormal transformation of the basis open.
+
+    Parameters
+    ----------
+    cameras : ndarray, shape (n, 3, 4)
+        Cameras.
+    Q : ndarray, shape (4, m)
+        Homogeneous points, not all in one plane.
+
+    Returns
+    -------
+    cameras, Q : ndarray
+        The same geometry; where no such basis exists (too many points in a plane or on a line)
+        the last one reached.
+    """
+    for _ in range(100):
+        Q = Q / np.linalg.norm(Q, axis=0)
+        values, vectors = np.linalg.eigh(Q @ Q.T * (4.0 / Q.shape[1]))
+        if values[0] <= 1e-12 or abs(values - 1.0).max() <= 1e-12:
+            break
+        Q = (vectors / np.sqrt(values)) @ vectors.T @ Q
+        cameras = cameras @ ((vectors * np.sqrt(values)) @ vectors.T)
+    return cameras / np.linalg.norm(cameras, axis=(1, 2), keepdims=True), Q
+
+
+@dataclass(frozen=True)
+class FreeState:
+    """Cameras and points, residuals with their Jacobian blocks, root weights and cost."""
+
+    cameras: Array
+    Q: Array
+    r: Array
+    J_P: Array
+    J_Q: Array
+    root: Array
+    cost: float
+
+
+class FreeProblem:
+    """Robust weighted sum of squared residuals as a function of 24 + 4 m homogeneous entries.
+
+    Parameters
+    ----------
+    kernels : Table
+        Backend.
+    q1, q2 : ndarray, shape (2, m)
+        Conditioned matches.
+    weights : ndarray, shape (m,)
+        Factor of the cost of each match.
+    loss : Loss
+        Applied to the squared residual of each match.
+    normalized : bool
+        NORMALIZED: the estimate is moved to the normalised basis before each iteration, and the
+        first-order constraints that keep it there are added to the normal equations.
+    """
+
+    def __init__(
+        self, kernels: Table, q1: Array, q2: Array, weights: Array, loss: Loss, normalized: bool
+    ) -> None:
+        self.kernels = kernels
+        self.q = np.concatenate([q1, q2])
+        self.weights, self.loss = weights, loss
+        self.normalized = normalized
+        self.floor = 0.5 * float(np.sum(weights)) * 1e-30
+
+    def start(self, F: Array) -> Estimate:
+        """Return the canonic cameras and the points of smallest reprojection error."""
+        factors = factorize(F)
+        P2 = self.kernels.canonical_camera(*factors)
+        F = self.kernels.fundamental_from_factors(*factors)
+        a, b, c = first_structure(self.kernels, F, P2, self.q[:2], self.q[2:])
+        cameras = np.stack([np.eye(3, 4), P2])
+        return self._settled(cameras, np.stack([a, b, np.ones_like(a), c]))
+
+    def evaluate(self, estimate: Estimate) -> FreeState:
+        """Return the state of cameras and points."""
+        cameras, Q = estimate
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            views = [self.kernels.project(P[..., None], Q) for P in cameras]
+            r = self.q - np.concatenate([q_hat for q_hat, _, _, _ in views])
+            cost, root = reweighted(r, self.weights, self.loss)
+        J_P = -np.stack([J for _, J, _, _ in views])
+        J_Q = -np.concatenate([J for _, _, J, _ in views])
+        return FreeState(cameras, Q, r, J_P, J_Q, root, cost)
+
+    def linearize(self, state: FreeState) -> Arrow:
+        """Return the normal equations, with the gauge constraints where they are wanted."""
+        m = state.Q.shape[1]
+        r, J_Q = state.root * state.r, state.root * state.J_Q
+        A = np.zeros((24, 4, m))
+        A[:12, :2] = np.swapaxes(state.root * state.J_P[0], 0, 1)
+        A[12:, 2:] = np.swapaxes(state.root * state.J_P[1], 0, 1)
+        flat = A.reshape(24, 4 * m)
+        U = flat @ flat.T
+        V = np.einsum("ikm,ilm->mkl", J_Q, J_Q)
+        border = None
+        if self.normalized:
+            # Weighted like the rest of the system, so that damping sees no foreign scale.
+            weight = float(np.mean(np.einsum("mkk->mk", V)))
+            for k in (0, 1):
+                P = state.cameras[k].ravel()
+                U[12 * k : 12 * k + 12, 12 * k : 12 * k + 12] += weight * np.outer(P, P)
+            V = V + weight * np.einsum("km,lm->mkl", state.Q, state.Q)
+            border = np.sqrt(weight) * _scatter_constraints(state.Q)
+        return Arrow(
+            U=U,
+            W=np.einsum("pim,ikm->mpk", A, J_Q),
+            V=V,
+            g_motion=flat @ r.ravel(),
+            g_points=np.einsum("ikm,im->mk", J_Q, r),
+            border=border,
+        )
+
+    def retract(self, state: FreeState, step: Array) -> Estimate:
+        """Return cameras and points that a step leads to."""
+        cameras = state.cameras + step[:24].reshape(2, 3, 4)
+        return self._settled(cameras, state.Q + step[24:].reshape(-1, 4).T)
+
+    def fundamental(self, state: FreeState) -> Array:
+        """Return F of a state."""
+        return fundamental_from_cameras(state.cameras)
+
+    def _settled(self, cameras: Array, Q: Array) -> Estimate:
+        return normalized_basis(cameras, Q) if self.normalized else (cameras, Q)
+
+
+def _scatter_constraints(Q: Array) -> Array:
+    """Return the ten first-order constraints sum (Q dQ^T + dQ Q^T) = 0, shape (m, 4, 10)."""
+    columns = []
+    for a in range(4):
+        for b in range(a, 4):
+            column = np.zeros((Q.shape[1], 4))
+            column[:, a] += Q[b]
+            column[:, b] += Q[a]
+            columns.append(column)
+    return np.stack(columns, axis=2)

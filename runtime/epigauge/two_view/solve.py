@@ -1,0 +1,243 @@
+"""From options to a problem and its minimum, in conditioned coordinates.
+
+This is where parameterisation, criterion, structure, damping and loss meet; `refine` checks the
+caller's arguments before and brings the result back to pixels afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge import lm
+from epigauge.kernels import Table
+from epigauge.linear import Levenberg, Seber
+from epigauge.two_view.conditioning import Conditioning, condition, displaced
+from epigauge.two_view.criteria import CRITERIA
+from epigauge.two_view.eliminated import EliminatedProblem
+from epigauge.two_view.free import FreeProblem
+from epigauge.two_view.joint import JointProblem
+from epigauge.two_view.losses import EFFICIENT, Loss, robust_scale
+from epigauge.two_view.parameterizations import (
+    PARAMETERIZATIONS,
+    Ortho,
+    Parameterization,
+    ParFree,
+    Reduced,
+    Remapped,
+    frozen_directions,
+)
+
+__all__ = ["DAMPINGS", "REDUNDANT", "Matches", "Options", "Solution", "minimize"]
+
+Array = NDArray[np.float64]
+
+DAMPINGS: dict[str, type[Levenberg] | type[Seber]] = {"levenberg": Levenberg, "seber": Seber}
+
+#: Parameterisations by cameras, more than seven parameters, always solved jointly with the points.
+REDUNDANT = ("parfree", "free", "normalized")
+
+#: The scale of a loss is estimated anew until it changes by less than this (relative).
+_SCALE_SETTLED = 1e-3
+_SCALE_ROUNDS = 10
+
+
+@dataclass(frozen=True)
+class Options:
+    """The choices of `refine_fundamental`, checked."""
+
+    parameterization: str = "ortho"
+    criterion: str = "reprojection"
+    structure: str = "eliminated"
+    damping: str = "levenberg"
+    hessian: str = "exact"
+    fix: tuple[str, ...] = ()
+    calibration: tuple[Array, Array] | None = None
+    loss: str = "linear"
+    loss_scale_px: float | None = None
+    stopping: lm.Stopping = lm.Stopping()
+
+    def scaled_loss(self, scale: float) -> Loss:
+        """Return the loss with a scale in conditioned coordinates."""
+        return Loss(self.loss, scale)
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Matches with weights, in the coordinates that are computed in.
+
+    Attributes
+    ----------
+    table : Table
+        Backend.
+    frame : Conditioning
+        These coordinates.
+    q1, q2 : ndarray, shape (2, m)
+        Matches.
+    weights : ndarray, shape (m,)
+        Factor of the cost of each match.
+    """
+
+    table: Table
+    frame: Conditioning
+    q1: Array
+    q2: Array
+    weights: Array
+
+    @staticmethod
+    def of(x1: Array, x2: Array, weights: Array, F: Array, table: Table) -> Matches:
+        """Condition matches in pixels around those that count, for a start value in pixels."""
+        counts = weights > 0.0
+        frame = condition(x1[counts], x2[counts])
+        frame = displaced(frame, frame.from_pixels(F))
+        return Matches(table, frame, *frame.forward(x1, x2), weights)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A minimum in conditioned coordinates.
+
+    Attributes
+    ----------
+    F : ndarray, shape (3, 3)
+        Fundamental matrix.
+    chart : Parameterization
+        Seven or fewer parameters around it, for derivatives.
+    motion : Any
+        The estimate in this chart.
+    outcome : lm.Outcome
+        How it was found.
+    loss_scale_px : float
+        Scale of the loss; 0 for the linear one.
+    """
+
+    F: Array
+    chart: Parameterization
+    motion: Any
+    outcome: lm.Outcome[Any]
+    loss_scale_px: float
+
+
+def minimize(
+    matches: Matches,
+    options: Options,
+    start: Array,
+    callback: Callable[[lm.Row], object] | None = None,
+) -> Solution:
+    """Minimise from a start value.
+
+    Parameters
+    ----------
+    matches : Matches
+        What is fitted.
+    options : Options
+        How.
+    start : ndarray, shape (3, 3)
+        Conditioned F.
+    callback : callable, optional
+        As in `epigauge.lm.minimize`.
+
+    Returns
+    -------
+    Solution
+        The minimum. With a loss scale to be estimated, that of the last of several rounds, and the
+        history of all of them.
+    """
+    if options.loss == "linear" or options.loss_scale_px is not None:
+        return _minimize_once(matches, options, start, callback)
+    history: tuple[lm.Row, ...] = ()
+    njev = 0
+    scale = _estimated_scale(matches, options, start)
+    for _ in range(_SCALE_ROUNDS):
+        fixed = replace(options, loss_scale_px=scale)
+        solution = _minimize_once(matches, fixed, start, callback)
+        history = _joined(history, solution.outcome.history)
+        njev += solution.outcome.njev
+        start = solution.F
+        previous, scale = scale, _estimated_scale(matches, options, start)
+        if abs(scale - previous) <= _SCALE_SETTLED * previous or solution.outcome.status < 0:
+            break
+    counts = {"nfev": len(history), "njev": njev, "nit": history[-1].iteration}
+    return replace(solution, outcome=replace(solution.outcome, history=history, **counts))
+
+
+def _minimize_once(
+    matches: Matches,
+    options: Options,
+    start: Array,
+    callback: Callable[[lm.Row], object] | None,
+) -> Solution:
+    scale_px = 0.0 if options.loss_scale_px is None else options.loss_scale_px
+    loss = options.scaled_loss(scale_px / matches.frame.scale)
+    chart = _chart(matches, options)
+    problem = _problem(matches, options, chart, loss)
+    outcome: lm.Outcome[Any] = lm.minimize(
+        problem,
+        problem.start(start),
+        DAMPINGS[options.damping](),
+        lm.Classic(),
+        options.stopping,
+        callback,
+        matches.frame.scale**2,
+    )
+    if options.parameterization in REDUNDANT:
+        assert isinstance(problem, FreeProblem | JointProblem)
+        F = problem.fundamental(outcome.state)
+        motion = chart.start(F)
+    else:
+        motion = outcome.state.motion
+    return Solution(chart.fundamental(motion), chart, motion, outcome, scale_px)
+
+
+def _chart(matches: Matches, options: Options) -> Parameterization:
+    """Return the minimal parameterisation, restricted as asked for."""
+    name = "ortho" if options.parameterization in REDUNDANT else options.parameterization
+    kind = PARAMETERIZATIONS[name]
+    chart: Parameterization = kind(matches.table)
+    to1, to2 = matches.frame.maps_from_pixels()
+    if options.calibration is not None:
+        K1, K2 = options.calibration
+        return Remapped(Ortho.essential(matches.table), to1 @ K1, to2 @ K2)
+    if options.fix:
+        basis = frozen_directions(kind.parts, options.fix)
+        return Remapped(Reduced(chart, basis), to1, to2)
+    return chart
+
+
+def _problem(
+    matches: Matches, options: Options, chart: Parameterization, loss: Loss
+) -> EliminatedProblem | JointProblem | FreeProblem:
+    table, q1, q2, weights = matches.table, matches.q1, matches.q2, matches.weights
+    if options.parameterization in ("free", "normalized"):
+        normalized = options.parameterization == "normalized"
+        return FreeProblem(table, q1, q2, weights, loss, normalized)
+    if options.parameterization == "parfree":
+        return JointProblem(table, ParFree(table), q1, q2, weights, loss)
+    if options.structure == "joint":
+        return JointProblem(table, chart, q1, q2, weights, loss)
+    criterion = CRITERIA[options.criterion](table, q1, q2)
+    return EliminatedProblem(criterion, chart, weights, loss, options.hessian == "exact")
+
+
+def _estimated_scale(matches: Matches, options: Options, F: Array) -> float:
+    """Return the scale of the loss, in pixels, at which it is 95 % efficient for clean data."""
+    criterion = CRITERIA[options.criterion](matches.table, matches.q1, matches.q2)
+    counts = matches.weights > 0.0
+    sigma = robust_scale(criterion.evaluate(F).signed[counts])
+    # Noise-free data: any scale will do that is not zero.
+    return EFFICIENT[options.loss] * max(sigma, 1e-12) * matches.frame.scale
+
+
+def _joined(first: tuple[lm.Row, ...], second: tuple[lm.Row, ...]) -> tuple[lm.Row, ...]:
+    """Return two histories as one."""
+    if not first:
+        return second
+    last = first[-1]
+    return first + tuple(
+        replace(row, iteration=row.iteration + last.iteration, seconds=row.seconds + last.seconds)
+        for row in second
+    )
