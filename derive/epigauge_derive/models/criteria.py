@@ -20,11 +20,6 @@ def constraint() -> sp.Expr:
     return (homogeneous(Q2).T * F.matrix() * homogeneous(Q1))[0]
 
 
-def algebraic() -> list[sp.Expr]:
-    """Return the algebraic residual."""
-    return [constraint()]
-
-
 def epipolar() -> list[sp.Expr]:
     """Return the signed distances of q to the line F^T q' and of q' to the line F q."""
     lines = (F.matrix().T * homogeneous(Q2), F.matrix() * homogeneous(Q1))
@@ -40,33 +35,28 @@ def sampson() -> list[sp.Expr]:
 
 def kernels() -> list[Kernel]:
     """Return residuals, and for the geometric ones what the solver sums up."""
-    made = [
-        *_residual("algebraic", "r = q'^T F q (B&S section 4).", algebraic()),
+    lines = (
+        "signed distances in pixels of q to the line F^T q' and of q' to the line F q (B&S "
+        "section 4, point-to-epipolar-line criterion)."
+    )
+    weighted = (
+        "r = C / |dC/d(q, q')| with C = q'^T F q, in pixels (gradient-weighted criterion, B&S "
+        "section 4)."
+    )
+    return [
+        _residual("algebraic", "r = q'^T F q (B&S section 4).", [constraint()]),
+        _residual("epipolar", lines, epipolar()),
+        *_normal_equations("epipolar", epipolar()),
+        _residual("sampson", weighted, sampson()),
+        *_normal_equations("sampson", sampson()),
     ]
-    for name, formula, residuals in (
-        (
-            "epipolar",
-            "signed distances in pixels of q to the line F^T q' and of q' to the line F q (B&S "
-            "section 4, point-to-epipolar-line criterion).",
-            epipolar(),
-        ),
-        (
-            "sampson",
-            "r = C / |dC/d(q, q')| with C = q'^T F q, in pixels (gradient-weighted criterion, B&S "
-            "section 4).",
-            sampson(),
-        ),
-    ):
-        made += _residual(name, formula, residuals)
-        made += _normal_equations(name, residuals)
-    return made
 
 
-def _residual(name: str, formula: str, residuals: list[sp.Expr]) -> list[Kernel]:
+def _residual(name: str, formula: str, residuals: list[sp.Expr]) -> Kernel:
     derivatives = jacobian(residuals, F.entries())
     shape = (len(residuals), 9)
     outputs = (Output.of("r", residuals), Output("dr_dF", shape, tuple(derivatives)))
-    return [Kernel(name, formula, (F, Q1, Q2), outputs)]
+    return Kernel(name, formula, (F, Q1, Q2), outputs)
 
 
 def _normal_equations(name: str, residuals: list[sp.Expr]) -> list[Kernel]:

@@ -7,7 +7,7 @@ by the update parameters, at no update.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from epigauge.kernels import Table
 
 __all__ = [
     "PARAMETERIZATIONS",
+    "RESTRICTABLE",
     "Block",
     "BlockF",
     "Maps",
@@ -31,6 +32,7 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+Parts = dict[str, tuple[int, ...]]
 
 
 class Parameterization(Protocol):
@@ -94,7 +96,11 @@ class Ortho:
 
     dimension = 7
     #: Parameters that move each part of the epipolar geometry (B&S section 4.4).
-    parts = {"epipole2": (0, 1), "epipole1": (3, 4), "epipolar_transformation": (2, 5, 6)}
+    parts: ClassVar[Parts] = {
+        "epipole2": (0, 1),
+        "epipole1": (3, 4),
+        "epipolar_transformation": (2, 5, 6),
+    }
 
     def __init__(self, kernels: Table, essential: bool = False) -> None:
         self._kernels = kernels
@@ -147,7 +153,12 @@ class Block:
     """Seven parameters, regular at sigma = 1: the epipoles by rotations, M in its tangent plane."""
 
     dimension = 7
-    parts = {"epipole2": (0, 1), "epipole1": (2, 3), "epipolar_transformation": (4, 5, 6)}
+    #: Parameters that move each part of the epipolar geometry.
+    parts: ClassVar[Parts] = {
+        "epipole2": (0, 1),
+        "epipole1": (2, 3),
+        "epipolar_transformation": (4, 5, 6),
+    }
 
     def __init__(self, kernels: Table) -> None:
         self._kernels = kernels
@@ -342,7 +353,7 @@ class Remapped:
         return self._inner.retract(estimate, delta)
 
 
-def frozen_directions(parts: dict[str, tuple[int, ...]], fix: tuple[str, ...]) -> Array:
+def frozen_directions(parts: Parts, fix: tuple[str, ...]) -> Array:
     """Return the basis for `Reduced` that freezes parts of the epipolar geometry.
 
     Parameters
@@ -360,6 +371,9 @@ def frozen_directions(parts: dict[str, tuple[int, ...]], fix: tuple[str, ...]) -
     frozen = {index for part in fix for index in parts[part]}
     return np.eye(7)[:, [k for k in range(7) if k not in frozen]]
 
+
+#: Those whose parameters keep the parts of the epipolar geometry separate.
+RESTRICTABLE: dict[str, type[Ortho] | type[Block]] = {"ortho": Ortho, "block": Block}
 
 #: The minimal parameterisations by name: of F alone, for any structure.
 PARAMETERIZATIONS: dict[str, type[Ortho] | type[Block] | type[Maps]] = {

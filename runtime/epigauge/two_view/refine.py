@@ -25,7 +25,12 @@ from epigauge.two_view.geometry import canonical_cameras
 from epigauge.two_view.initial import fundamental_8point
 from epigauge.two_view.joint import intersect
 from epigauge.two_view.losses import LOSSES
-from epigauge.two_view.parameterizations import PARAMETERIZATIONS, Ortho, factorize
+from epigauge.two_view.parameterizations import (
+    PARAMETERIZATIONS,
+    RESTRICTABLE,
+    Ortho,
+    factorize,
+)
 from epigauge.two_view.result import FundamentalResult
 from epigauge.two_view.solve import DAMPINGS, REDUNDANT, Matches, Options, Solution, minimize
 
@@ -147,9 +152,7 @@ def refine_fundamental(
         structure=as_choice("structure", structure, ("eliminated", "joint")),
         damping=as_choice("damping", damping, DAMPINGS),
         hessian=as_choice("hessian", hessian, ("exact", "gauss-newton")),
-        fix=tuple(
-            as_choice("fix", p, Ortho.parts) for p in ([fix] if isinstance(fix, str) else fix)
-        ),
+        fix=_parts(fix),
         calibration=_calibration(essential, K1, K2),
         loss=as_choice("loss", loss, LOSSES),
         loss_scale_px=None
@@ -165,6 +168,12 @@ def refine_fundamental(
     matches = Matches.of(x1, x2, w, start, kernels.table(backend))
     solution = minimize(matches, options, matches.frame.from_pixels(start), callback)
     return _result(solution, options, matches, noise_px)
+
+
+def _parts(fix: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the parts to freeze, each once."""
+    names = (fix,) if isinstance(fix, str) else tuple(fix)
+    return tuple(dict.fromkeys(as_choice("fix", name, Ortho.parts) for name in names))
 
 
 def _calibration(
@@ -184,13 +193,13 @@ def _check_combination(options: Options) -> None:
     restricted = "fix" if options.fix else "essential" if options.calibration is not None else ""
     if options.fix and options.calibration is not None:
         raise ArgumentError("fix", "is combined with essential=True", "one of the two")
-    if restricted and options.parameterization not in ("ortho", "block"):
+    if restricted and options.parameterization not in RESTRICTABLE:
         raise ArgumentError(
             "parameterization",
             f"is {options.parameterization!r} with {restricted}",
             "'ortho' or 'block', whose parameters keep the parts of F separate",
         )
-    if len(set(options.fix)) == len(Ortho.parts):
+    if len(options.fix) == len(Ortho.parts):
         raise ArgumentError("fix", "names every part of F", "something left to refine")
     joint = options.structure == "joint" or options.parameterization in REDUNDANT
     if joint and options.criterion != "reprojection":
@@ -244,7 +253,7 @@ def _result(
     cost = outcome.state.cost * frame.scale**2
     if noise_px is None:
         noise_px = float(np.sqrt(2.0 * cost / max(np.count_nonzero(weights) - 7, 1)))
-    # The derivatives are by F of the norm it has inside; those by F of unit norm are so much larger.
+    # Derivatives are by F of the norm it has inside; those by F of unit norm are so much larger.
     norm = float(np.linalg.norm(solution.F))
     uncertainty = fundamental_covariance(
         solution.F / norm,

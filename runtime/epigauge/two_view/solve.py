@@ -7,7 +7,7 @@ caller's arguments before and brings the result back to pixels afterwards.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from epigauge.two_view.joint import JointProblem
 from epigauge.two_view.losses import EFFICIENT, Loss, robust_scale
 from epigauge.two_view.parameterizations import (
     PARAMETERIZATIONS,
+    RESTRICTABLE,
     Ortho,
     Parameterization,
     ParFree,
@@ -59,7 +60,7 @@ class Options:
     calibration: tuple[Array, Array] | None = None
     loss: str = "linear"
     loss_scale_px: float | None = None
-    stopping: lm.Stopping = lm.Stopping()
+    stopping: lm.Stopping = field(default_factory=lm.Stopping)
 
     def scaled_loss(self, scale: float) -> Loss:
         """Return the loss with a scale in conditioned coordinates."""
@@ -161,8 +162,9 @@ def minimize(
         previous, scale = scale, _estimated_scale(matches, options, start)
         if abs(scale - previous) <= _SCALE_SETTLED * previous or solution.outcome.status < 0:
             break
-    counts = {"nfev": len(history), "njev": njev, "nit": history[-1].iteration}
-    return replace(solution, outcome=replace(solution.outcome, history=history, **counts))
+    nit = history[-1].iteration
+    outcome = replace(solution.outcome, history=history, nfev=len(history), njev=njev, nit=nit)
+    return replace(solution, outcome=outcome)
 
 
 def _minimize_once(
@@ -203,7 +205,7 @@ def _chart(matches: Matches, options: Options) -> Parameterization:
         K1, K2 = options.calibration
         return Remapped(Ortho.essential(matches.table), to1 @ K1, to2 @ K2)
     if options.fix:
-        basis = frozen_directions(kind.parts, options.fix)
+        basis = frozen_directions(RESTRICTABLE[name].parts, options.fix)
         return Remapped(Reduced(chart, basis), to1, to2)
     return chart
 
