@@ -10,6 +10,7 @@ from epigauge.errors import ArgumentError, BackendError, EpigaugeError, FileForm
 from epigauge.io import Matches, load_matches, save_matches, save_result
 from epigauge.kernels import backend, set_backend
 from epigauge.scenes import TwoViewScene, two_view_scene
+from epigauge.two_view.batch import BATCH_STATUS, FundamentalBatch, refine_fundamental_batch
 from epigauge.two_view.geometry import (
     canonical_cameras,
     reprojection_distances,
@@ -23,10 +24,12 @@ from epigauge.two_view.result import FundamentalResult
 __version__ = "0.1.0"
 
 __all__ = [
+    "BATCH_STATUS",
     "ArgumentError",
     "BackendError",
     "EpigaugeError",
     "FileFormatError",
+    "FundamentalBatch",
     "FundamentalResult",
     "Matches",
     "TwoViewScene",
@@ -37,6 +40,7 @@ __all__ = [
     "kernels",
     "load_matches",
     "refine_fundamental",
+    "refine_fundamental_batch",
     "reprojection_distances",
     "sampson_distances",
     "save_matches",
