@@ -85,6 +85,156 @@ EG_EXPORT void eg_project(
     }
 }
 
+/* Formula: derivatives of log(p3^T Q) by vect(P) and by Q; a gauge transformation only adds a
+   constant to this logarithm.
+   Inputs:  P (3, 4), Q (4,)
+   Outputs: Z_P (12,), Z_Q (4,)
+   Operations: 16, temporaries: 1. */
+EG_EXPORT void eg_log_depth_derivatives(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P,
+    const double *EG_RESTRICT Q,
+    double *EG_RESTRICT Z_P,
+    double *EG_RESTRICT Z_Q)
+{
+    memset(Z_P, 0, 12 * (size_t)n * sizeof(double));
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double P20 = P[8*n + i];
+        const double P21 = P[9*n + i];
+        const double P22 = P[10*n + i];
+        const double P23 = P[11*n + i];
+        const double Q0 = Q[i];
+        const double Q1 = Q[n + i];
+        const double Q2 = Q[2*n + i];
+        const double Q3 = Q[3*n + i];
+        const double t0 = 1.0/(P20*Q0 + P21*Q1 + P22*Q2 + P23*Q3);
+        Z_P[8*n + i] = Q0*t0;
+        Z_P[9*n + i] = Q1*t0;
+        Z_P[10*n + i] = Q2*t0;
+        Z_P[11*n + i] = Q3*t0;
+        Z_Q[i] = P20*t0;
+        Z_Q[n + i] = P21*t0;
+        Z_Q[2*n + i] = P22*t0;
+        Z_Q[3*n + i] = P23*t0;
+    }
+}
+
+/* Formula: derivatives of vect(P exp(E)) by the entries of E, at E = 0 (generators of B03 eq.
+   5).
+   Inputs:  P (3, 4)
+   Outputs: G (12, 16)
+   Operations: 0, temporaries: 0. */
+EG_EXPORT void eg_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P,
+    double *EG_RESTRICT G)
+{
+    memset(G, 0, 192 * (size_t)n * sizeof(double));
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double P00 = P[i];
+        const double P01 = P[n + i];
+        const double P02 = P[2*n + i];
+        const double P03 = P[3*n + i];
+        const double P10 = P[4*n + i];
+        const double P11 = P[5*n + i];
+        const double P12 = P[6*n + i];
+        const double P13 = P[7*n + i];
+        const double P20 = P[8*n + i];
+        const double P21 = P[9*n + i];
+        const double P22 = P[10*n + i];
+        const double P23 = P[11*n + i];
+        G[i] = P00;
+        G[4*n + i] = P01;
+        G[8*n + i] = P02;
+        G[12*n + i] = P03;
+        G[17*n + i] = P00;
+        G[21*n + i] = P01;
+        G[25*n + i] = P02;
+        G[29*n + i] = P03;
+        G[34*n + i] = P00;
+        G[38*n + i] = P01;
+        G[42*n + i] = P02;
+        G[46*n + i] = P03;
+        G[51*n + i] = P00;
+        G[55*n + i] = P01;
+        G[59*n + i] = P02;
+        G[63*n + i] = P03;
+        G[64*n + i] = P10;
+        G[68*n + i] = P11;
+        G[72*n + i] = P12;
+        G[76*n + i] = P13;
+        G[81*n + i] = P10;
+        G[85*n + i] = P11;
+        G[89*n + i] = P12;
+        G[93*n + i] = P13;
+        G[98*n + i] = P10;
+        G[102*n + i] = P11;
+        G[106*n + i] = P12;
+        G[110*n + i] = P13;
+        G[115*n + i] = P10;
+        G[119*n + i] = P11;
+        G[123*n + i] = P12;
+        G[127*n + i] = P13;
+        G[128*n + i] = P20;
+        G[132*n + i] = P21;
+        G[136*n + i] = P22;
+        G[140*n + i] = P23;
+        G[145*n + i] = P20;
+        G[149*n + i] = P21;
+        G[153*n + i] = P22;
+        G[157*n + i] = P23;
+        G[162*n + i] = P20;
+        G[166*n + i] = P21;
+        G[170*n + i] = P22;
+        G[174*n + i] = P23;
+        G[179*n + i] = P20;
+        G[183*n + i] = P21;
+        G[187*n + i] = P22;
+        G[191*n + i] = P23;
+    }
+}
+
+/* Formula: derivatives of exp(-E) Q by the entries of E, at E = 0 (generators of B03 eq. 5).
+   Inputs:  Q (4,)
+   Outputs: G (4, 16)
+   Operations: 4, temporaries: 4. */
+EG_EXPORT void eg_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT Q,
+    double *EG_RESTRICT G)
+{
+    memset(G, 0, 64 * (size_t)n * sizeof(double));
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double Q0 = Q[i];
+        const double Q1 = Q[n + i];
+        const double Q2 = Q[2*n + i];
+        const double Q3 = Q[3*n + i];
+        const double t0 = -Q0;
+        const double t1 = -Q1;
+        const double t2 = -Q2;
+        const double t3 = -Q3;
+        G[i] = t0;
+        G[n + i] = t1;
+        G[2*n + i] = t2;
+        G[3*n + i] = t3;
+        G[20*n + i] = t0;
+        G[21*n + i] = t1;
+        G[22*n + i] = t2;
+        G[23*n + i] = t3;
+        G[40*n + i] = t0;
+        G[41*n + i] = t1;
+        G[42*n + i] = t2;
+        G[43*n + i] = t3;
+        G[60*n + i] = t0;
+        G[61*n + i] = t1;
+        G[62*n + i] = t2;
+        G[63*n + i] = t3;
+    }
+}
+
 /* Formula: residual r = q - q_hat of a point (a, b, 1, c) in P = (I | 0) and P', its Jacobian
    by the point, and that of the second image by vect(P') (B&S sections 4.1, 4.3, 5).
    Inputs:  P2 (3, 4) shared, S (3,), q1 (2,), q2 (2,)

@@ -59,6 +59,23 @@ EG_EXPORT void eg_project(
     double *EG_RESTRICT J_Q,
     double *EG_RESTRICT depth);
 
+EG_EXPORT void eg_log_depth_derivatives(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P,
+    const double *EG_RESTRICT Q,
+    double *EG_RESTRICT Z_P,
+    double *EG_RESTRICT Z_Q);
+
+EG_EXPORT void eg_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P,
+    double *EG_RESTRICT G);
+
+EG_EXPORT void eg_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT Q,
+    double *EG_RESTRICT G);
+
 EG_EXPORT void eg_two_view_structure(
     ptrdiff_t n,
     const double *EG_RESTRICT P2,

@@ -19,7 +19,7 @@ class Signature(NamedTuple):
     formula: str
 
 
-C_DIGEST = "dc3a1687f9fb26e5"
+C_DIGEST = "cca21203867e8d06"
 
 SIGNATURES = {
     "block_derivatives": Signature(
@@ -45,6 +45,24 @@ SIGNATURES = {
         (Argument("P", (3, 4), True), Argument("Q", (4,), True), ),
         (Argument("q_hat", (2,), True), Argument("J_P", (2, 12), True), Argument("J_Q", (2, 4), True), Argument("depth", (), True), ),
         "projection of Q by P, its Jacobians by vect(P) and by Q, and the homogeneous scale (depth) p3^T Q (B03 section 3).",
+    ),
+    "log_depth_derivatives": Signature(
+        "camera",
+        (Argument("P", (3, 4), True), Argument("Q", (4,), True), ),
+        (Argument("Z_P", (12,), True), Argument("Z_Q", (4,), True), ),
+        "derivatives of log(p3^T Q) by vect(P) and by Q; a gauge transformation only adds a constant to this logarithm.",
+    ),
+    "camera_generators": Signature(
+        "camera",
+        (Argument("P", (3, 4), True), ),
+        (Argument("G", (12, 16), True), ),
+        "derivatives of vect(P exp(E)) by the entries of E, at E = 0 (generators of B03 eq. 5).",
+    ),
+    "point_generators": Signature(
+        "camera",
+        (Argument("Q", (4,), True), ),
+        (Argument("G", (4, 16), True), ),
+        "derivatives of exp(-E) Q by the entries of E, at E = 0 (generators of B03 eq. 5).",
     ),
     "two_view_structure": Signature(
         "camera",

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-
-from epigauge.lm import System
 
 __all__ = ["Arrow", "Dense", "Levenberg", "Seber"]
 
@@ -18,17 +17,27 @@ Array = NDArray[np.float64]
 _LIFT = 1e-3
 
 
+class _Solvable(Protocol):
+    """A linear system that two dampings can be added to."""
+
+    def largest(self) -> float:
+        """Return the largest diagonal entry of the Hessian."""
+
+    def solve(self, lam: float, *, scaled: bool) -> Array:
+        """Return -(H + lam W)^-1 g, with W = I or, if scaled, W = diag(J^T J)."""
+
+
 @dataclass(frozen=True)
 class Levenberg:
     """Damping lambda I, called LM in B&S; the first lambda is relative to the largest diagonal."""
 
     relative: float = 1e-3
 
-    def start(self, system: System) -> float:
+    def start(self, system: _Solvable) -> float:
         """Return `relative` times the largest diagonal entry."""
         return self.relative * max(system.largest(), 1e-300)
 
-    def step(self, system: System, lam: float) -> Array:
+    def step(self, system: _Solvable, lam: float) -> Array:
         """Return -(H + lam I)^-1 g."""
         return system.solve(lam, scaled=False)
 
@@ -39,11 +48,11 @@ class Seber:
 
     relative: float = 1e-3
 
-    def start(self, system: System) -> float:
+    def start(self, system: _Solvable) -> float:
         """Return `relative`, since this damping scales with the system."""
         return self.relative
 
-    def step(self, system: System, lam: float) -> Array:
+    def step(self, system: _Solvable, lam: float) -> Array:
         """Return -(H + lam diag(J^T J))^-1 g."""
         return system.solve(lam, scaled=True)
 

@@ -63,7 +63,7 @@ S = TypeVar("S", bound=State)
 
 
 class System(Protocol):
-    """A problem linearised at one estimate: gradient, (approximate) Hessian and how to solve."""
+    """A problem linearised at one estimate; how it is solved is between it and its dampings."""
 
     @property
     def gradient(self) -> Array:
@@ -71,9 +71,6 @@ class System(Protocol):
 
     def largest(self) -> float:
         """Return the largest diagonal entry of the Hessian."""
-
-    def solve(self, lam: float, *, scaled: bool) -> Array:
-        """Return -(H + lam W)^-1 g, with W = I or, if scaled, W = diag(J^T J)."""
 
     def predicted(self, step: Array) -> float:
         """Return the decrease of the cost that the quadratic model promises for a step."""
@@ -101,10 +98,10 @@ class Problem(Protocol[S]):
 class Damping(Protocol):
     """Turns a linear system and lambda into a step."""
 
-    def start(self, system: System) -> float:
+    def start(self, system: Any) -> float:
         """Return the first lambda."""
 
-    def step(self, system: System, lam: float) -> Array:
+    def step(self, system: Any, lam: float) -> Array:
         """Return the step."""
 
 

@@ -17,6 +17,7 @@ def kernels() -> list[Kernel]:
     """Return the projection with its Jacobians by vect(P) and Q, and the two-view residual."""
     P, Q = Input("P", (3, 4)), Input("Q", (4,))
     q_hat = project(P.matrix(), Q.matrix())
+    depth = (P.matrix() * Q.matrix())[2]
     return [
         Kernel(
             "project",
@@ -27,10 +28,49 @@ def kernels() -> list[Kernel]:
                 Output.of("q_hat", q_hat),
                 Output.of("J_P", jacobian(list(q_hat), P.entries())),
                 Output.of("J_Q", jacobian(list(q_hat), Q.entries())),
-                Output.of("depth", (P.matrix() * Q.matrix())[2]),
+                Output.of("depth", depth),
             ),
         ),
+        Kernel(
+            "log_depth_derivatives",
+            "derivatives of log(p3^T Q) by vect(P) and by Q; a gauge transformation only adds a "
+            "constant to this logarithm.",
+            (P, Q),
+            (
+                Output.of("Z_P", derivative_of_log(depth, P.entries())),
+                Output.of("Z_Q", derivative_of_log(depth, Q.entries())),
+            ),
+        ),
+        *_generators(P, Q),
         _two_view_structure(),
+    ]
+
+
+def derivative_of_log(value: sp.Expr, variables: list[sp.Symbol]) -> list[sp.Expr]:
+    """Differentiate log |value|."""
+    return [sp.diff(value, variable) / value for variable in variables]
+
+
+def _generators(P: Input, Q: Input) -> list[Kernel]:
+    """Return the directions in which a change of basis moves a camera and a point.
+
+    P exp(E) and exp(-E) Q to first order, for the sixteen entries of E: with the scales they span
+    the null space of the normal equations.
+    """
+    E = sp.Matrix(4, 4, lambda i, j: sp.Symbol(f"E{i}{j}", real=True))
+    camera = P.matrix() * (sp.eye(4) + E)
+    point = (sp.eye(4) - E) * Q.matrix()
+    return [
+        Kernel(
+            f"{name}_generators",
+            f"derivatives of {what} by the entries of E, at E = 0 (generators of B03 eq. 5).",
+            (argument,),
+            (Output.of("G", jacobian(list(moved), list(E))),),
+        )
+        for name, what, argument, moved in (
+            ("camera", "vect(P exp(E))", P, camera),
+            ("point", "exp(-E) Q", Q, point),
+        )
     ]
 
 

@@ -72,6 +72,133 @@ def project(P, Q, q_hat, J_P, J_Q, depth):
     depth[...] = t1
 
 
+def log_depth_derivatives(P, Q, Z_P, Z_Q):
+    # Formula: derivatives of log(p3^T Q) by vect(P) and by Q; a gauge transformation only adds a
+    # constant to this logarithm.
+    # Inputs:  P (3, 4), Q (4,)
+    # Outputs: Z_P (12,), Z_Q (4,)
+    # Operations: 16, temporaries: 1.
+    P20 = P[2, 0]
+    P21 = P[2, 1]
+    P22 = P[2, 2]
+    P23 = P[2, 3]
+    Q0 = Q[0]
+    Q1 = Q[1]
+    Q2 = Q[2]
+    Q3 = Q[3]
+    t0 = 1.0/(P20*Q0 + P21*Q1 + P22*Q2 + P23*Q3)
+    Z_P[...] = 0.0
+    Z_P[8] = Q0*t0
+    Z_P[9] = Q1*t0
+    Z_P[10] = Q2*t0
+    Z_P[11] = Q3*t0
+    Z_Q[0] = P20*t0
+    Z_Q[1] = P21*t0
+    Z_Q[2] = P22*t0
+    Z_Q[3] = P23*t0
+
+
+def camera_generators(P, G):
+    # Formula: derivatives of vect(P exp(E)) by the entries of E, at E = 0 (generators of B03 eq.
+    # 5).
+    # Inputs:  P (3, 4)
+    # Outputs: G (12, 16)
+    # Operations: 0, temporaries: 0.
+    P00 = P[0, 0]
+    P01 = P[0, 1]
+    P02 = P[0, 2]
+    P03 = P[0, 3]
+    P10 = P[1, 0]
+    P11 = P[1, 1]
+    P12 = P[1, 2]
+    P13 = P[1, 3]
+    P20 = P[2, 0]
+    P21 = P[2, 1]
+    P22 = P[2, 2]
+    P23 = P[2, 3]
+    G[...] = 0.0
+    G[0, 0] = P00
+    G[0, 4] = P01
+    G[0, 8] = P02
+    G[0, 12] = P03
+    G[1, 1] = P00
+    G[1, 5] = P01
+    G[1, 9] = P02
+    G[1, 13] = P03
+    G[2, 2] = P00
+    G[2, 6] = P01
+    G[2, 10] = P02
+    G[2, 14] = P03
+    G[3, 3] = P00
+    G[3, 7] = P01
+    G[3, 11] = P02
+    G[3, 15] = P03
+    G[4, 0] = P10
+    G[4, 4] = P11
+    G[4, 8] = P12
+    G[4, 12] = P13
+    G[5, 1] = P10
+    G[5, 5] = P11
+    G[5, 9] = P12
+    G[5, 13] = P13
+    G[6, 2] = P10
+    G[6, 6] = P11
+    G[6, 10] = P12
+    G[6, 14] = P13
+    G[7, 3] = P10
+    G[7, 7] = P11
+    G[7, 11] = P12
+    G[7, 15] = P13
+    G[8, 0] = P20
+    G[8, 4] = P21
+    G[8, 8] = P22
+    G[8, 12] = P23
+    G[9, 1] = P20
+    G[9, 5] = P21
+    G[9, 9] = P22
+    G[9, 13] = P23
+    G[10, 2] = P20
+    G[10, 6] = P21
+    G[10, 10] = P22
+    G[10, 14] = P23
+    G[11, 3] = P20
+    G[11, 7] = P21
+    G[11, 11] = P22
+    G[11, 15] = P23
+
+
+def point_generators(Q, G):
+    # Formula: derivatives of exp(-E) Q by the entries of E, at E = 0 (generators of B03 eq. 5).
+    # Inputs:  Q (4,)
+    # Outputs: G (4, 16)
+    # Operations: 4, temporaries: 4.
+    Q0 = Q[0]
+    Q1 = Q[1]
+    Q2 = Q[2]
+    Q3 = Q[3]
+    t0 = -Q0
+    t1 = -Q1
+    t2 = -Q2
+    t3 = -Q3
+    G[...] = 0.0
+    G[0, 0] = t0
+    G[0, 1] = t1
+    G[0, 2] = t2
+    G[0, 3] = t3
+    G[1, 4] = t0
+    G[1, 5] = t1
+    G[1, 6] = t2
+    G[1, 7] = t3
+    G[2, 8] = t0
+    G[2, 9] = t1
+    G[2, 10] = t2
+    G[2, 11] = t3
+    G[3, 12] = t0
+    G[3, 13] = t1
+    G[3, 14] = t2
+    G[3, 15] = t3
+
+
 def two_view_structure(P2, S, q1, q2, r, J_S, J_P2):
     # Formula: residual r = q - q_hat of a point (a, b, 1, c) in P = (I | 0) and P', its Jacobian
     # by the point, and that of the second image by vect(P') (B&S sections 4.1, 4.3, 5).

@@ -1,0 +1,1 @@
+"""Many views: projective bundle adjustment of cameras and points in any gauge."""

@@ -1,0 +1,246 @@
+"""Projective bundle adjustment with any gauge strategy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge import kernels, lm
+from epigauge._arguments import as_choice, as_positive
+from epigauge.errors import ArgumentError
+from epigauge.multi_view import dampings
+from epigauge.multi_view.gauge import Gauge, five_points, identity, normalized
+from epigauge.multi_view.initialize import Frame, initialize
+from epigauge.multi_view.problem import BundleProblem
+from epigauge.multi_view.strategies import (
+    STRATEGIES,
+    ExplicitProblem,
+    RestrictedProblem,
+    Strategy,
+)
+from epigauge.multi_view.system import Layout
+from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
+
+__all__ = ["BundleResult", "bundle_adjust"]
+
+Array = NDArray[np.float64]
+
+_DAMPINGS: dict[str, Callable[[], Any]] = {
+    "levenberg": dampings.Levenberg,
+    "marquardt": dampings.Marquardt,
+    "covariant": dampings.Covariant,
+    "gauge_invariant": dampings.GaugeInvariant,
+    "gauge_invariant_factor": lambda: dampings.GaugeInvariant("factor"),
+    "none": dampings.PseudoInverse,
+}
+_SCHEDULES: dict[str, Callable[[], lm.Schedule]] = {"classic": lm.Classic, "nielsen": lm.Nielsen}
+
+
+@dataclass(frozen=True)
+class BundleResult:
+    """An adjusted reconstruction and how it was found. All lengths are in pixels.
+
+    Attributes
+    ----------
+    reconstruction : Reconstruction
+        Cameras and points; with method "covariant" in the basis of the start.
+    rms_px : float
+        sqrt(sum of squared residual coordinates / (2 N)).
+    cost : float
+        0.5 * (weighted, robust) sum of squared residuals, in px^2.
+    fun : ndarray, shape (N, 2)
+        Residuals q - q_hat, in the order of the tracks.
+    method : str
+        Name of the strategy.
+    loss_scale_px : float
+        Scale of the robust loss; 0 for the linear loss.
+    nfev, njev, nit, status, message, success, history
+        As in `FundamentalResult`.
+    """
+
+    reconstruction: Reconstruction = field(repr=False)
+    rms_px: float
+    cost: float
+    fun: Array = field(repr=False)
+    method: str
+    loss_scale_px: float
+    nfev: int
+    njev: int
+    nit: int
+    status: int
+    message: str
+    success: bool
+    history: tuple[lm.Row, ...] = field(repr=False)
+
+
+def bundle_adjust(
+    tracks: Tracks,
+    start: Reconstruction | None = None,
+    *,
+    method: str = "covariant",
+    gauge: Gauge | None = None,
+    gauge_mode: str = "explicit",
+    damping: str | None = None,
+    embedded: bool = True,
+    schedule: str = "classic",
+    loss: str = "linear",
+    loss_scale_px: float | str = "auto",
+    ftol: float = 1e-8,
+    xtol: float = 0.0,
+    gtol: float = 0.0,
+    max_iter: int = 100,
+    backend: str | None = None,
+    callback: Callable[[lm.Row], object] | None = None,
+) -> BundleResult:
+    """Minimise the reprojection error of cameras and points, up to a projective basis.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Observations.
+    start : Reconstruction, optional
+        Where to begin, in any basis; by default `initialize(tracks)`.
+    method : str
+        Strategy: "covariant" (default) gives the same iterations in every basis; "free",
+        "hartley", "bartoli", "faugeras", "mclauchlan", "kanatani" and "gauge_invariant" are those
+        of B03; "levenberg" and "marquardt" leave everything free.
+    gauge : Gauge, optional
+        For methods that leave everything free: a gauge to iterate in, such as
+        ``eg.gauge.normalized()``.
+    gauge_mode : {"explicit", "implicit"}
+        Move the estimate into the gauge before each iteration, or choose the damping that acts as
+        if it were there (B03 eq. 9): the same iterates up to the gauge.
+    damping : {"levenberg", "marquardt", "covariant", "gauge_invariant", "none"}, optional
+        Another damping than the method's own.
+    embedded : bool
+        With "covariant", re-triangulate all points after each step.
+    schedule : {"classic", "nielsen"}
+        Rule for lambda.
+    loss : {"linear", "huber", "soft_l1", "cauchy", "truncated"}
+        Robust loss of each squared residual.
+    loss_scale_px : float or "auto"
+        Scale of the loss in pixels; by default from the residuals of the start.
+    ftol, xtol, gtol : float
+        As in `epigauge.lm.minimize`; `xtol` and `gtol` depend on the gauge and are off.
+    max_iter : int
+        Trial steps allowed.
+    backend : {"c", "numpy", "casadi"}, optional
+        Where the formulas are computed.
+    callback : callable, optional
+        Called with each row of the history; a true return value stops.
+
+    Returns
+    -------
+    BundleResult
+        Reconstruction, residuals and history.
+
+    Raises
+    ------
+    ArgumentError
+        On unknown names, options that exclude one another, or a start of another size.
+
+    References
+    ----------
+    .. [B03] A. Bartoli, "Towards gauge invariant bundle adjustment", ICCV 2003.
+    """
+    strategy = STRATEGIES[as_choice("method", method, STRATEGIES)]
+    as_choice("gauge_mode", gauge_mode, ("explicit", "implicit"))
+    as_choice("schedule", schedule, _SCHEDULES)
+    as_choice("loss", loss, LOSSES)
+    if damping is not None:
+        as_choice("damping", damping, _DAMPINGS)
+    if gauge is not None and (strategy.gauge is not None or strategy.reference):
+        raise ArgumentError("gauge", f"is given with method={method!r}", "a method without its own")
+    stopping = lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter)
+    table = kernels.table(backend)
+    if start is None:
+        start = initialize(tracks, backend=backend)
+    if len(start.P) != tracks.n_views or len(start.Q) != tracks.n_points:
+        raise ArgumentError(
+            "start",
+            f"has {len(start.P)} cameras and {len(start.Q)} points",
+            f"{tracks.n_views} and {tracks.n_points}, as the tracks",
+        )
+    frame = Frame.of(tracks)
+    layout = Layout(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+    scale_px = _loss_scale(loss, loss_scale_px, tracks, start)
+    parts = (
+        table,
+        layout,
+        frame.conditioned(tracks),
+        np.asarray(tracks.weights),
+        Loss(loss, scale_px / frame.scale),
+        embedded and strategy.embedded and damping in (None, "covariant"),
+    )
+    act: Any = strategy.damping() if damping is None else _DAMPINGS[damping]()
+    P, Q = frame.cameras_in(start.P), start.Q
+    explicit = strategy.gauge if strategy.explicit else gauge
+    if gauge is not None and gauge_mode == "implicit":
+        act, explicit = dampings.Implicit(act, gauge), None
+    # The best conditioned basis, where the method does not mind and the caller does not ask.
+    home = normalized() if isinstance(act, dampings.Covariant) and gauge is None else identity()
+    first = strategy.gauge or explicit or home
+    there = first.transformation(P, Q)
+    problem = _problem(strategy, explicit, parts, Q)
+    outcome: lm.Outcome[Any] = lm.minimize(
+        problem,
+        there.apply(P, Q),
+        act,
+        _SCHEDULES[schedule](),
+        stopping,
+        callback,
+        frame.scale**2,
+    )
+    P, Q = outcome.state.P, outcome.state.Q
+    if first is home:
+        P, Q = there.inverse().apply(P, Q)
+    reconstruction = Reconstruction(frame.cameras_out(P), Q)
+    residuals = tracks.xy - reconstruction.project(tracks)
+    return BundleResult(
+        reconstruction=reconstruction,
+        rms_px=float(np.sqrt(np.mean(residuals**2))),
+        cost=outcome.state.cost * frame.scale**2,
+        fun=residuals,
+        method=method,
+        loss_scale_px=scale_px,
+        nfev=outcome.nfev,
+        njev=outcome.njev,
+        nit=outcome.nit,
+        status=outcome.status,
+        message=lm.STATUS[outcome.status],
+        success=outcome.status > 0,
+        history=outcome.history,
+    )
+
+
+def _problem(
+    strategy: Strategy, explicit: Gauge | None, parts: tuple[Any, ...], Q: Array
+) -> BundleProblem:
+    """Return the problem with its frozen parameters or its gauge."""
+    if strategy.reference:
+        restricted = RestrictedProblem(*parts)
+        restricted.reference = strategy.reference
+        restricted.points = five_points.choose(Q) if strategy.reference == "points" else []
+        return restricted
+    if explicit is not None:
+        moved = ExplicitProblem(*parts)
+        moved.gauge, moved.every = explicit, strategy.every
+        moved.constrained = strategy.constrained
+        return moved
+    return BundleProblem(*parts)
+
+
+def _loss_scale(
+    loss: str, loss_scale_px: float | str, tracks: Tracks, start: Reconstruction
+) -> float:
+    if loss == "linear":
+        return 0.0
+    if loss_scale_px != "auto":
+        return as_positive("loss_scale_px", loss_scale_px)
+    distances = np.linalg.norm(tracks.xy - start.project(tracks), axis=1)
+    return EFFICIENT[loss] * max(robust_scale(distances), 1e-12)

@@ -1,0 +1,313 @@
+"""Gauges: changes of projective basis and scales, and rules that choose one (B03 sections 4, 5).
+
+A `Transformation` is the T~ of B03 eq. (5). A gauge is an object that finds the transformation
+which moves a reconstruction to where the gauge wants it. Two reconstructions of the same geometry
+are moved to the same place, up to signs and, for the normalised basis, an orthonormal change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge.errors import ArgumentError
+from epigauge.multi_view.tracks import Reconstruction
+
+__all__ = [
+    "Gauge",
+    "Transformation",
+    "equivalent",
+    "five_points",
+    "identity",
+    "normalized",
+    "reference_camera",
+    "transform",
+    "two_cameras",
+]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Transformation:
+    """P_i <- camera_scales_i P_i T and Q_j <- point_scales_j T^-1 Q_j (B03 section 4.1).
+
+    Attributes
+    ----------
+    T : ndarray, shape (4, 4)
+        Invertible.
+    camera_scales, point_scales : ndarray, shape (n,), (m,)
+        gamma and alpha, none zero.
+    """
+
+    T: Array
+    camera_scales: Array
+    point_scales: Array
+
+    def apply(self, P: Array, Q: Array) -> tuple[Array, Array]:
+        """Return the moved cameras and points."""
+        cameras = self.camera_scales[:, None, None] * (P @ self.T)
+        return cameras, self.point_scales[:, None] * np.linalg.solve(self.T, Q.T).T
+
+    def inverse(self) -> Transformation:
+        """Return the transformation back."""
+        return Transformation(
+            np.asarray(np.linalg.inv(self.T)), 1.0 / self.camera_scales, 1.0 / self.point_scales
+        )
+
+    def blocks(self) -> tuple[Array, Array]:
+        """Return the blocks of T~ (B03 eq. 5), (n, 12, 12) and (m, 4, 4)."""
+        cameras = self.camera_scales[:, None, None] * np.asarray(np.kron(np.eye(3), self.T.T))
+        return cameras, self.point_scales[:, None, None] * np.linalg.inv(self.T)
+
+
+class Gauge(Protocol):
+    """A rule that chooses basis and scales."""
+
+    def transformation(self, P: Array, Q: Array) -> Transformation:
+        """Return what moves cameras (n, 3, 4) and points (m, 4) into the gauge."""
+
+
+def transform(
+    reconstruction: Reconstruction,
+    T: ArrayLike,
+    camera_scales: ArrayLike = 1.0,
+    point_scales: ArrayLike = 1.0,
+) -> Reconstruction:
+    """Apply a gauge transformation, which changes no projected point.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        Cameras and points.
+    T : array_like, shape (4, 4)
+        Change of basis, invertible.
+    camera_scales, point_scales : array_like
+        Factors of each camera and point, or one for all; none zero.
+
+    Returns
+    -------
+    Reconstruction
+        P_i' = gamma_i P_i T, Q_j' = alpha_j T^-1 Q_j.
+
+    Raises
+    ------
+    ArgumentError
+        If T is singular or a scale is zero.
+    """
+    matrix = np.asarray(T, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ArgumentError("T", f"has shape {matrix.shape}", "a finite (4, 4) matrix")
+    if np.linalg.cond(matrix) > 1e15:
+        raise ArgumentError("T", "is singular", "an invertible (4, 4) matrix")
+    scales = []
+    for name, value, count in (
+        ("camera_scales", camera_scales, len(reconstruction.P)),
+        ("point_scales", point_scales, len(reconstruction.Q)),
+    ):
+        array = np.broadcast_to(np.asarray(value, dtype=np.float64), (count,))
+        if not np.isfinite(array).all() or (array == 0.0).any():
+            raise ArgumentError(name, "has a zero or is not finite", "finite factors, none zero")
+        scales.append(array)
+    return Reconstruction(
+        *Transformation(matrix, *scales).apply(reconstruction.P, reconstruction.Q)
+    )
+
+
+def equivalent(a: Reconstruction, b: Reconstruction, tol: float = 1e-8) -> bool:
+    """Tell whether two reconstructions are the same geometry (B03 eq. 6).
+
+    Parameters
+    ----------
+    a, b : Reconstruction
+        Of the same views and points.
+    tol : float
+        Largest sine of the angle between a camera (or point) of b and its image from a, as vectors
+        of R^12 (R^4), in the basis where the points of b are spread evenly.
+
+    Returns
+    -------
+    bool
+        True where some T, gamma, alpha take a to b.
+    """
+    if a.P.shape != b.P.shape or a.Q.shape != b.Q.shape:
+        return False
+    P_a, Q_a = normalized().transformation(a.P, a.Q).apply(a.P, a.Q)
+    P_b, Q_b = normalized().transformation(b.P, b.Q).apply(b.P, b.Q)
+    # P_a T ~ P_b: the part of P_a T across P_b vanishes; the unknown is vect(T).
+    normal = np.zeros((16, 16))
+    for camera_a, camera_b in zip(P_a, P_b, strict=True):
+        linear = np.kron(camera_a, np.eye(4))
+        across = linear - np.outer(camera_b.ravel(), camera_b.ravel() @ linear)
+        normal += across.T @ across
+    T = np.linalg.eigh(normal)[1][:, 0].reshape(4, 4)
+    if np.linalg.cond(T) > 1e12:
+        return False
+    ones = (np.ones(len(P_a)), np.ones(len(Q_a)))
+    moved_P, moved_Q = Transformation(T, *ones).apply(P_a, Q_a)
+    return _sine(moved_P.reshape(-1, 12), P_b.reshape(-1, 12)) <= tol and _sine(moved_Q, Q_b) <= tol
+
+
+@dataclass(frozen=True)
+class identity:
+    """The gauge the reconstruction is in."""
+
+    def transformation(self, P: Array, Q: Array) -> Transformation:
+        """Return the transformation that moves nothing."""
+        return Transformation(np.eye(4), np.ones(len(P)), np.ones(len(Q)))
+
+
+@dataclass(frozen=True)
+class reference_camera:
+    """One camera is (I | 0) and points are (a, b, 1, c); the others have unit norm.
+
+    What this leaves open, the plane at infinity and the scene's scale, is fixed by c being
+    orthogonal to a, b and 1 over the points, and of unit mean square.
+
+    Parameters
+    ----------
+    camera : int
+        Number of the reference camera.
+    """
+
+    camera: int = 0
+
+    def transformation(self, P: Array, Q: Array) -> Transformation:
+        """Return what moves cameras and points into the gauge."""
+        T = _camera_basis(P[self.camera])
+        Q = np.linalg.solve(T, Q.T).T
+        plane, depth = Q[:, :3] / Q[:, 2:3], Q[:, 3] / Q[:, 2]
+        across, *_ = np.linalg.lstsq(plane, depth, rcond=None)
+        size = float(np.sqrt(np.mean((depth - plane @ across) ** 2)))
+        # (q, c) <- (q, (c - across q) / size)
+        slide = np.eye(4)
+        slide[3, :3], slide[3, 3] = across, size
+        return _scaled(T @ slide, P, Q[:, 2], self.camera)
+
+
+@dataclass(frozen=True)
+class two_cameras:
+    """One camera is (I | 0), another the canonic (H* | e') of B&S eq. (5); points (a, b, 1, c).
+
+    Parameters
+    ----------
+    first, second : int
+        Numbers of the reference cameras.
+    """
+
+    first: int = 0
+    second: int = 1
+
+    def transformation(self, P: Array, Q: Array) -> Transformation:
+        """Return what moves cameras and points into the gauge."""
+        T = _camera_basis(P[self.first])
+        camera = P[self.second] @ T
+        H, e = camera[:, :3], camera[:, 3]
+        length = float(np.linalg.norm(e))
+        across = -(e @ H) / length**2
+        size = float(np.linalg.norm(H + np.outer(e, across), 2)) / length
+        slide = np.eye(4)
+        slide[3, :3], slide[3, 3] = across, size
+        T = T @ slide
+        third = np.linalg.solve(T, Q.T)[2]
+        found = _scaled(T, P, third, self.first)
+        found.camera_scales[self.second] = 1.0 / np.linalg.norm((P[self.second] @ T)[:, 3])
+        return found
+
+
+@dataclass(frozen=True)
+class five_points:
+    """Five points are the standard projective basis; all cameras and points have unit norm.
+
+    Parameters
+    ----------
+    points : sequence of int, optional
+        Numbers of the five; by default those found by `choose`, the best conditioned.
+    """
+
+    points: Sequence[int] | None = None
+
+    def transformation(self, P: Array, Q: Array) -> Transformation:
+        """Return what moves cameras and points into the gauge."""
+        chosen = self.choose(Q) if self.points is None else list(self.points)
+        basis = Q[chosen[:4]].T
+        T = basis * np.linalg.solve(basis, Q[chosen[4]])
+        return _unit_scales(T, P, Q)
+
+    @staticmethod
+    def choose(Q: Array, candidates: int = 12) -> list[int]:
+        """Return five points whose smallest 4x4 minor is the largest among some candidates.
+
+        The candidates are spread as far as possible in the normalised basis.
+        """
+        moved = normalized().transformation(np.zeros((0, 3, 4)), Q).apply(np.zeros((0, 3, 4)), Q)[1]
+        spread = [int(np.argmax(np.abs(moved[:, 0])))]
+        rest = moved.copy()
+        while len(spread) < min(candidates, len(Q)):
+            nearest = np.abs(rest @ moved[spread].T).max(axis=1)
+            nearest[spread] = np.inf
+            spread.append(int(np.argmin(nearest)))
+        minors = {
+            four: abs(np.linalg.det(moved[list(four)])) for four in combinations(sorted(spread), 4)
+        }
+        return list(
+            max(
+                combinations(sorted(spread), 5),
+                key=lambda five: min(minors[four] for four in combinations(five, 4)),
+            )
+        )
+
+
+@dataclass(frozen=True)
+class normalized:
+    """Unit-norm cameras and points with sum Q Q^T = (m / 4) I: the best conditioned basis.
+
+    The fixed point of Tyler's scatter iteration; an orthonormal change of basis is left open.
+    """
+
+    def transformation(self, P: Array, Q: Array) -> Transformation:
+        """Return what moves cameras and points into the gauge."""
+        T = np.eye(4)
+        moved = Q / np.linalg.norm(Q, axis=1, keepdims=True)
+        for _ in range(200):
+            values, vectors = np.linalg.eigh(moved.T @ moved * (4.0 / len(Q)))
+            if values[0] <= 1e-14 or abs(values - 1.0).max() <= 1e-13:
+                break
+            T = T @ ((vectors * np.sqrt(values)) @ vectors.T)
+            moved = moved @ ((vectors / np.sqrt(values)) @ vectors.T)
+            moved = moved / np.linalg.norm(moved, axis=1, keepdims=True)
+        return _unit_scales(T, P, Q)
+
+
+def _unit_scales(T: Array, P: Array, Q: Array) -> Transformation:
+    """Return T with the scales that make every camera and point of unit norm."""
+    moved_P, moved_Q = P @ T, np.linalg.solve(T, Q.T)
+    return Transformation(
+        T, 1.0 / np.linalg.norm(moved_P, axis=(1, 2)), 1.0 / np.linalg.norm(moved_Q, axis=0)
+    )
+
+
+def _scaled(T: Array, P: Array, third: Array, camera: int) -> Transformation:
+    """Return T with points scaled to third coordinate one, cameras to unit norm but for one."""
+    scales = 1.0 / np.linalg.norm(P @ T, axis=(1, 2))
+    scales[camera] = 1.0
+    return Transformation(T, scales, 1.0 / third)
+
+
+def _camera_basis(P: Array) -> Array:
+    """Return T with P T = (I | 0): pseudo-inverse, then camera centre."""
+    centre = np.linalg.svd(P)[2][3]
+    return np.column_stack([np.linalg.pinv(P), centre])
+
+
+def _sine(a: Array, b: Array) -> float:
+    """Return the largest sine of the angle between corresponding rows."""
+    a = a / np.linalg.norm(a, axis=1, keepdims=True)
+    b = b / np.linalg.norm(b, axis=1, keepdims=True)
+    along = np.sum(a * b, axis=1, keepdims=True)
+    return float(np.linalg.norm(a - along * b, axis=1).max(initial=0.0))

@@ -1,0 +1,320 @@
+"""A first reconstruction: two views, then the other cameras registered in turn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge import lm
+from epigauge.errors import ArgumentError
+from epigauge.kernels import Table, table
+from epigauge.linear import Dense, Levenberg
+from epigauge.multi_view.gauge import normalized
+from epigauge.multi_view.problem import BundleProblem
+from epigauge.multi_view.system import Layout
+from epigauge.multi_view.tracks import MIN_POINTS, Reconstruction, Tracks
+from epigauge.two_view.geometry import canonical_cameras
+from epigauge.two_view.losses import EFFICIENT, Loss, robust_scale
+from epigauge.two_view.refine import refine_fundamental
+
+__all__ = ["Frame", "initialize"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: Pairs of views, those with most common points, that are tried as a start.
+_PAIRS = 40
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Image coordinates to compute in: each view's centroid, one scale for all.
+
+    Attributes
+    ----------
+    origins : ndarray, shape (n, 2)
+        Centroids of the views, in pixels.
+    scale : float
+        Pixels a unit; coordinates then have an RMS of one.
+    """
+
+    origins: Array
+    scale: float
+
+    @staticmethod
+    def of(tracks: Tracks) -> Frame:
+        """Choose the coordinates for some tracks."""
+        counts = np.bincount(tracks.view, minlength=tracks.n_views)
+        sums = [np.bincount(tracks.view, tracks.xy[:, k]) / counts for k in (0, 1)]
+        origins = np.stack(sums, axis=1)
+        centred = tracks.xy - origins[tracks.view]
+        return Frame(origins, float(np.sqrt(np.mean(centred**2))))
+
+    def conditioned(self, tracks: Tracks) -> Array:
+        """Return the conditioned observations, shape (2, N)."""
+        return np.ascontiguousarray(((tracks.xy - self.origins[tracks.view]) / self.scale).T)
+
+    def cameras_in(self, P: Array) -> Array:
+        """Return cameras to conditioned coordinates from cameras to pixels."""
+        moved = P.copy()
+        moved[:, :2] = (P[:, :2] - self.origins[:, :, None] * P[:, 2:]) / self.scale
+        return moved
+
+    def cameras_out(self, P: Array) -> Array:
+        """Return cameras to pixels from cameras to conditioned coordinates."""
+        moved = P.copy()
+        moved[:, :2] = self.scale * P[:, :2] + self.origins[:, :, None] * P[:, 2:]
+        return moved
+
+
+def initialize(tracks: Tracks, *, backend: str | None = None) -> Reconstruction:
+    """Reconstruct from two views with strong geometry and register the other cameras in turn.
+
+    Robust against gross errors in some tracks: two-view geometry, resection and triangulation use
+    the Cauchy loss with a scale estimated from the residuals.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Observations.
+    backend : {"c", "numpy", "casadi"}, optional
+        Where the formulas are computed.
+
+    Returns
+    -------
+    Reconstruction
+        All cameras and points, to start `bundle_adjust` from.
+
+    Raises
+    ------
+    ArgumentError
+        If a view shares fewer than 6 points with those registered before it.
+    """
+    kernels = table(backend)
+    frame = Frame.of(tracks)
+    builder = _Builder(tracks, frame.conditioned(tracks), kernels)
+    builder.begin(*_best_pair(tracks, frame))
+    while not builder.registered.all():
+        builder.register(builder.next_view())
+    return Reconstruction(frame.cameras_out(builder.P), builder.Q)
+
+
+def _best_pair(tracks: Tracks, frame: Frame) -> tuple[int, int]:
+    """Choose the pair with the most points that no homography explains."""
+    incidence = np.zeros((tracks.n_points, tracks.n_views), dtype=np.float32)
+    incidence[tracks.point, tracks.view] = 1.0
+    common = np.triu(incidence.T @ incidence, 1)
+    best, chosen = -1.0, (0, 1)
+    for flat in np.argsort(-common, axis=None)[:_PAIRS]:
+        i, k = np.unravel_index(flat, common.shape)
+        if common[i, k] < 8:
+            break
+        x1, x2, _ = _matches(tracks, int(i), int(k))
+        parallax = _homography_residual(x1 - frame.origins[i], x2 - frame.origins[k])
+        score = float(common[i, k]) * parallax
+        if score > best:
+            best, chosen = score, (int(i), int(k))
+    if best < 0.0:
+        raise ArgumentError("tracks", "have no two views with 8 common points", "longer tracks")
+    return chosen
+
+
+def _matches(tracks: Tracks, i: int, k: int) -> tuple[Array, Array, Indices]:
+    """Return the matches of two views and the points they belong to."""
+    rows_i, rows_k = np.flatnonzero(tracks.view == i), np.flatnonzero(tracks.view == k)
+    points, at_i, at_k = np.intersect1d(
+        tracks.point[rows_i], tracks.point[rows_k], assume_unique=True, return_indices=True
+    )
+    return tracks.xy[rows_i[at_i]], tracks.xy[rows_k[at_k]], points
+
+
+def _homography_residual(x1: Array, x2: Array) -> float:
+    """Return the median transfer error of the homography fitted to matches (DLT)."""
+    scale = float(np.sqrt(np.mean(x1**2)))
+    a, b = np.column_stack([x1 / scale, np.ones(len(x1))]), x2 / scale
+    zero = np.zeros_like(a)
+    rows = np.concatenate(
+        [
+            np.hstack([a, zero, -b[:, :1] * a]),
+            np.hstack([zero, a, -b[:, 1:] * a]),
+        ]
+    )
+    H = np.linalg.svd(np.linalg.qr(rows, mode="r"))[2][-1].reshape(3, 3)
+    h = a @ H.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.linalg.norm(h[:, :2] / h[:, 2:] - b, axis=1)
+    return float(np.median(np.nan_to_num(error, nan=0.0, posinf=0.0))) * scale
+
+
+class _Builder:
+    """Cameras and points known so far."""
+
+    def __init__(self, tracks: Tracks, q: Array, kernels: Table) -> None:
+        self.tracks, self.q, self.kernels = tracks, q, kernels
+        self.P = np.zeros((tracks.n_views, 3, 4))
+        self.Q = np.zeros((tracks.n_points, 4))
+        self.registered = np.zeros(tracks.n_views, dtype=np.bool_)
+        self.known = np.zeros(tracks.n_points, dtype=np.bool_)
+
+    def begin(self, i: int, k: int) -> None:
+        """Start with two views."""
+        rows = self.tracks.view == i, self.tracks.view == k
+        points, at_i, at_k = np.intersect1d(
+            self.tracks.point[rows[0]], self.tracks.point[rows[1]], return_indices=True
+        )
+        x1, x2 = self.q[:, rows[0]][:, at_i].T, self.q[:, rows[1]][:, at_k].T
+        result = refine_fundamental(x1, x2, loss="cauchy", max_iter=200)
+        self.P[i], self.P[k] = canonical_cameras(result.F)
+        self.Q[points] = result.points
+        self.registered[[i, k]] = True
+        self.known[points] = True
+        self._spread()
+
+    def next_view(self) -> int:
+        """Return the view outside that sees the most known points."""
+        seen = self.known[self.tracks.point] & ~self.registered[self.tracks.view]
+        counts = np.bincount(self.tracks.view[seen], minlength=self.tracks.n_views)
+        view = int(np.argmax(counts))
+        if counts[view] < MIN_POINTS:
+            outside = np.flatnonzero(~self.registered)[:5].tolist()
+            raise ArgumentError(
+                "tracks",
+                f"leave views {outside} with fewer than {MIN_POINTS} points in common with the "
+                "others",
+                "longer or more tracks, or fewer views",
+            )
+        return view
+
+    def register(self, view: int) -> None:
+        """Find the camera of a view from known points, then the points it completes."""
+        rows = np.flatnonzero((self.tracks.view == view) & self.known[self.tracks.point])
+        self.P[view] = resect(self.kernels, self.q[:, rows], self.Q[self.tracks.point[rows]].T)
+        self.registered[view] = True
+        self._triangulate()
+        self._spread()
+
+    def _triangulate(self) -> None:
+        """Triangulate every point that two or more registered views see."""
+        usable = self.registered[self.tracks.view]
+        counts = np.bincount(self.tracks.point[usable], minlength=self.tracks.n_points)
+        rows = np.flatnonzero(usable & (counts[self.tracks.point] >= 2))
+        points, local = np.unique(self.tracks.point[rows], return_inverse=True)
+        layout = Layout(self.tracks.view[rows], local, self.tracks.n_views, len(points))
+        q = np.ascontiguousarray(self.q[:, rows])
+        problem = BundleProblem(self.kernels, layout, q, np.ones(len(rows)), Loss())
+        self.Q[points] = _intersected(self.P, self.Q[points], self.known[points], problem)
+        self.known[points] = True
+
+    def _spread(self) -> None:
+        """Move to the basis in which the known points are spread evenly."""
+        there = normalized().transformation(self.P[self.registered], self.Q[self.known])
+        self.P[self.registered], self.Q[self.known] = there.apply(
+            self.P[self.registered], self.Q[self.known]
+        )
+
+
+def _intersected(P: Array, Q: Array, known: NDArray[np.bool_], problem: BundleProblem) -> Array:
+    """Return points triangulated linearly where new, then refined, with a robust loss."""
+    layout, q = problem.layout, problem.q
+    cameras = P[layout.view]
+    gram = np.zeros((len(layout.view), 4, 4))
+    for k in (0, 1):
+        row = q[k][:, None] * cameras[:, 2] - cameras[:, k]
+        row = row / np.linalg.norm(row, axis=1, keepdims=True)
+        gram += row[:, :, None] * row[:, None, :]
+    linear = np.linalg.eigh(layout.sum_points(gram))[1][:, :, 0]
+    Q = np.where(known[:, None], Q, linear)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        residuals = np.linalg.norm(problem.evaluate((P, linear)).r, axis=0)
+    scale = EFFICIENT["cauchy"] * robust_scale(np.nan_to_num(residuals, posinf=1e3))
+    problem.loss = Loss("cauchy", max(scale, 1e-12))
+    # A known point may have been led astray by the new view's error: keep the better start.
+    costs = [_point_costs(problem, P, start) for start in (Q, linear)]
+    Q = np.where((costs[0] <= costs[1])[:, None], Q, linear)
+    return problem.triangulated(P, Q)
+
+
+def _point_costs(problem: BundleProblem, P: Array, Q: Array) -> Array:
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        rho, _, _ = problem.loss(np.sum(problem.evaluate((P, Q)).r ** 2, axis=0))
+    return np.nan_to_num(problem.layout.sum_points(rho), nan=np.inf)
+
+
+@dataclass(frozen=True)
+class _CameraState:
+    P: Array
+    r: Array
+    J: Array
+    root: Array
+    cost: float
+
+
+class _Resection:
+    """One camera from known points, robustly."""
+
+    floor = 0.0
+
+    def __init__(self, kernels: Table, q: Array, Q: Array, loss: Loss) -> None:
+        self.kernels, self.q, self.Q, self.loss = kernels, q, Q, loss
+
+    def evaluate(self, P: Array) -> _CameraState:
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            q_hat, J, _, _ = self.kernels.project(P[..., None], self.Q)
+            r = self.q - q_hat
+            rho, first, _ = self.loss(np.sum(r**2, axis=0))
+            cost = 0.5 * float(np.sum(rho))
+        return _CameraState(P, r, J, np.sqrt(first), cost if np.isfinite(cost) else float("inf"))
+
+    def linearize(self, state: _CameraState) -> Dense:
+        J = (-state.root * state.J).transpose(1, 0, 2).reshape(12, -1)
+        N = J @ J.T
+        return Dense(J @ (state.root * state.r).ravel(), N, np.diag(N).copy())
+
+    def retract(self, state: _CameraState, step: Array) -> Array:
+        return state.P + step.reshape(3, 4)
+
+
+def resect(kernels: Table, q: Array, Q: Array) -> Array:
+    """Return the camera that projects points to measurements: linear, then robustly refined.
+
+    Parameters
+    ----------
+    kernels : Table
+        Backend.
+    q, Q : ndarray, shape (2, c), (4, c)
+        At least six measurements and points.
+
+    Returns
+    -------
+    ndarray, shape (3, 4)
+        Camera of unit norm.
+    """
+    weights = np.ones(q.shape[1])
+    P = _linear_camera(q, Q, weights)
+    for _ in range(5):
+        residuals = np.linalg.norm(_Resection(kernels, q, Q, Loss()).evaluate(P).r, axis=0)
+        scale = EFFICIENT["cauchy"] * max(robust_scale(residuals), 1e-12)
+        problem = _Resection(kernels, q, Q, Loss("cauchy", scale))
+        found = lm.minimize(problem, P, Levenberg(), lm.Classic(), lm.Stopping(ftol=1e-6))
+        change = found.state.P / np.linalg.norm(found.state.P) - P / np.linalg.norm(P)
+        P = found.state.P
+        if np.linalg.norm(change) < 1e-8:
+            break
+    return np.asarray(P / np.linalg.norm(P))
+
+
+def _linear_camera(q: Array, Q: Array, weights: Array) -> Array:
+    """Return the camera of least algebraic error, with points in a basis that spreads them."""
+    there = normalized().transformation(np.zeros((0, 3, 4)), Q.T)
+    points = there.apply(np.zeros((0, 3, 4)), Q.T)[1]
+    zero = np.zeros_like(points)
+    rows = np.concatenate(
+        [
+            np.hstack([points, zero, -q[0][:, None] * points]),
+            np.hstack([zero, points, -q[1][:, None] * points]),
+        ]
+    )
+    camera = np.linalg.svd(np.linalg.qr(rows, mode="r"))[2][-1].reshape(3, 4)
+    return np.asarray(camera @ np.linalg.inv(there.T))

@@ -1,0 +1,226 @@
+"""Measured image points of many views, checked once, and reconstructions of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge._arguments import as_weights
+from epigauge.errors import ArgumentError
+
+__all__ = ["Reconstruction", "Tracks"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: A view needs this many points, a point this many views, for its parameters to be determined.
+MIN_POINTS, MIN_VIEWS = 6, 2
+
+
+class Tracks:
+    """Observations: point `point[k]` is measured at `xy[k]` in view `view[k]`.
+
+    Parameters
+    ----------
+    view, point : array_like of int, shape (N,)
+        Indices from 0, each of them used.
+    xy : array_like, shape (N, 2)
+        Pixels.
+    n_views, n_points : int, optional
+        Numbers of views and points; by default the largest index plus one.
+    weights : array_like, shape (N,), optional
+        Factor of each squared residual.
+
+    Attributes
+    ----------
+    view, point, xy, weights : ndarray
+        The same, sorted by point, then view; read-only.
+    order : ndarray of int, shape (N,)
+        Row of the input that each sorted row comes from.
+
+    Raises
+    ------
+    ArgumentError
+        On bad shapes, NaN, indices out of range or never used, a (view, point) pair given twice, a
+        point seen in fewer than 2 views, a view with fewer than 6 points, and tracks that fall
+        into parts without a common point; the message names rows. `Tracks.pruned` drops what is
+        too weak instead.
+    """
+
+    def __init__(
+        self,
+        view: ArrayLike,
+        point: ArrayLike,
+        xy: ArrayLike,
+        n_views: int | None = None,
+        n_points: int | None = None,
+        weights: ArrayLike | None = None,
+    ) -> None:
+        views, points = _indices("view", view), _indices("point", point)
+        pixels = np.asarray(xy)
+        if pixels.dtype.kind not in "iuf" or pixels.shape != (len(views), 2):
+            raise ArgumentError(
+                "xy", f"is {pixels.dtype} {pixels.shape}", f"real numbers, ({len(views)}, 2)"
+            )
+        if len(points) != len(views):
+            raise ArgumentError("point", f"has {len(points)} rows", f"{len(views)}, as view")
+        if not len(views):
+            raise ArgumentError("view", "is empty", "at least one observation")
+        bad = np.flatnonzero(~np.isfinite(pixels).all(axis=1))
+        if len(bad):
+            raise ArgumentError("xy", f"is not finite in row {bad[0]}", "finite pixels")
+        self.n_views = _extent("view", views, n_views)
+        self.n_points = _extent("point", points, n_points)
+        self.order: Indices = np.lexsort((views, points))
+        self.view: Indices = views[self.order]
+        self.point: Indices = points[self.order]
+        self.xy: Array = pixels[self.order].astype(np.float64)
+        w = np.ones(len(views)) if weights is None else as_weights(weights, len(views))
+        self.weights: Array = w[self.order]
+        self._check()
+        for array in (self.order, self.view, self.point, self.xy, self.weights):
+            array.setflags(write=False)
+
+    @classmethod
+    def pruned(
+        cls, view: ArrayLike, point: ArrayLike, xy: ArrayLike, weights: ArrayLike | None = None
+    ) -> tuple[Tracks, Indices, Indices]:
+        """Drop views and points with too few observations and renumber the rest.
+
+        Parameters
+        ----------
+        view, point, xy, weights
+            As for the constructor, with gaps allowed.
+
+        Returns
+        -------
+        tracks : Tracks
+            What is left.
+        views, points : ndarray of int
+            Old numbers of the views and points left.
+        """
+        views, points, pixels = _indices("view", view), _indices("point", point), np.asarray(xy)
+        keep = np.ones(len(views), dtype=np.bool_)
+        while keep.any():
+            per_view, per_point = np.bincount(views[keep]), np.bincount(points[keep])
+            strong = keep.copy()
+            strong[keep] = (per_view[views[keep]] >= MIN_POINTS) & (
+                per_point[points[keep]] >= MIN_VIEWS
+            )
+            if (strong == keep).all():
+                break
+            keep = strong
+        old_views, new_views = np.unique(views[keep], return_inverse=True)
+        old_points, new_points = np.unique(points[keep], return_inverse=True)
+        w = None if weights is None else np.asarray(weights)[keep]
+        return cls(new_views, new_points, pixels[keep], weights=w), old_views, old_points
+
+    def __len__(self) -> int:
+        """Return the number of observations."""
+        return len(self.view)
+
+    def __repr__(self) -> str:
+        return f"Tracks({self.n_views} views, {self.n_points} points, {len(self)} observations)"
+
+    def _check(self) -> None:
+        pairs = (np.diff(self.point) == 0) & (np.diff(self.view) == 0)
+        if pairs.any():
+            k = int(np.argmax(pairs))
+            rows = f"rows {self.order[k]} and {self.order[k + 1]}"
+            raise ArgumentError(
+                "view, point",
+                f"name view {self.view[k]}, point {self.point[k]} twice ({rows})",
+                "one observation of a point in a view",
+            )
+        for name, indices, least in (
+            ("point", self.point, MIN_VIEWS),
+            ("view", self.view, MIN_POINTS),
+        ):
+            counts = np.bincount(indices, minlength=getattr(self, f"n_{name}s"))
+            weak = np.flatnonzero(counts < least)
+            if len(weak):
+                named = ", ".join(map(str, weak[:5])) + (", ..." if len(weak) > 5 else "")
+                raise ArgumentError(
+                    name,
+                    f"{named} has fewer than {least} observations ({counts[weak[0]]})",
+                    "more observations, or Tracks.pruned(...) to drop such views and points",
+                )
+        parts = self._components()
+        if parts.max() > 0:
+            lonely = np.flatnonzero(parts != parts[0])
+            raise ArgumentError(
+                "view, point",
+                f"fall into {parts.max() + 1} parts: views {lonely[:5].tolist()} share no point "
+                "with view 0",
+                "connected tracks; reconstruct the parts one by one",
+            )
+
+    def _components(self) -> Indices:
+        """Return for each view the number of the connected part it belongs to."""
+        label = np.arange(self.n_views)
+        while True:
+            lowest = np.full(self.n_points, self.n_views)
+            np.minimum.at(lowest, self.point, label[self.view])
+            spread = label.copy()
+            np.minimum.at(spread, self.view, lowest[self.point])
+            if (spread == label).all():
+                return np.unique(label, return_inverse=True)[1]
+            label = spread
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Cameras and points up to a projective change of basis; scales are free too.
+
+    Attributes
+    ----------
+    P : ndarray, shape (n, 3, 4)
+        Cameras, to pixels.
+    Q : ndarray, shape (m, 4)
+        Homogeneous points.
+    """
+
+    P: Array
+    Q: Array
+
+    def __post_init__(self) -> None:
+        if self.P.ndim != 3 or self.P.shape[1:] != (3, 4) or not np.isfinite(self.P).all():
+            raise ArgumentError("P", f"has shape {self.P.shape}", "finite cameras, (n, 3, 4)")
+        if self.Q.ndim != 2 or self.Q.shape[1] != 4 or not np.isfinite(self.Q).all():
+            raise ArgumentError("Q", f"has shape {self.Q.shape}", "finite points, (m, 4)")
+
+    def project(self, tracks: Tracks) -> Array:
+        """Return the predicted pixels of all observations, shape (N, 2), in the tracks' order."""
+        h = np.einsum("nij,nj->ni", self.P[tracks.view], self.Q[tracks.point])
+        return h[:, :2] / h[:, 2:]
+
+    def rms_px(self, tracks: Tracks) -> float:
+        """Return sqrt(sum of squared residual coordinates / (2 N))."""
+        return float(np.sqrt(np.mean((tracks.xy - self.project(tracks)) ** 2)))
+
+
+def _indices(name: str, value: ArrayLike) -> Indices:
+    indices = np.asarray(value)
+    if indices.ndim != 1 or indices.dtype.kind not in "iu":
+        raise ArgumentError(name, f"is {indices.dtype} {indices.shape}", "integers, (N,)")
+    negative = np.flatnonzero(indices < 0)
+    if len(negative):
+        row = negative[0]
+        raise ArgumentError(name, f"is {indices[row]} in row {row}", "indices from 0")
+    return indices.astype(np.intp)
+
+
+def _extent(name: str, indices: Indices, given: int | None) -> int:
+    extent = int(indices.max()) + 1
+    if given is not None and given < extent:
+        row = int(np.argmax(indices))
+        raise ArgumentError(name, f"is {indices[row]} in row {row}", f"indices below {given}")
+    extent = extent if given is None else given
+    unused = np.flatnonzero(np.bincount(indices, minlength=extent) == 0)
+    if len(unused):
+        raise ArgumentError(
+            name, f"never is {unused[0]}", "every index used, or Tracks.pruned(...) to renumber"
+        )
+    return extent
