@@ -155,8 +155,11 @@ class Arrow:
         """Solve by the Schur complement of the points; the border by Woodbury's identity."""
         p, k = len(self.U), self.V.shape[1]
         if scaled:
-            U = self.U + lam * np.diag(np.diag(self.U))
-            V = self.V * (1.0 + lam * np.eye(k))
+            # A match of weight zero leaves zeros on the diagonal, which no factor would lift.
+            floor = np.finfo(float).eps * max(self.largest(), np.finfo(float).tiny)
+            U = self.U + lam * np.diag(np.maximum(np.diag(self.U), floor))
+            points = np.maximum(np.einsum("mkk->mk", self.V), floor)
+            V = self.V + lam * points[:, None, :] * np.eye(k)
         else:
             U = self.U + lam * np.eye(p)
             V = self.V + lam * np.eye(k)

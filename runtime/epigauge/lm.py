@@ -293,11 +293,18 @@ def minimize(
             return outcome(1)
         if system.decrement() <= stopping.ftol * state.cost:
             return outcome(4)
+        ceiling = _LAM_CEILING * max(system.largest(), 1e-300)
         while True:
             if iteration >= stopping.max_iter:
                 return outcome(0)
+            try:
+                step = damping.step(system, lam)
+            except np.linalg.LinAlgError:  # singular to rounding: more damping
+                lam = schedule.rejected(lam)
+                if lam > ceiling:
+                    return outcome(-1)
+                continue
             iteration += 1
-            step = damping.step(system, lam)
             trial = problem.evaluate(problem.retract(state, step))
             decrease = state.cost - trial.cost
             norm = float(np.linalg.norm(step))
@@ -310,7 +317,7 @@ def minimize(
             if abs(decrease) <= 1e-15 * state.cost:
                 return outcome(2)
             lam = schedule.rejected(lam)
-            if lam > _LAM_CEILING * max(system.largest(), 1e-300):
+            if lam > ceiling:
                 return outcome(-1)
         predicted = system.predicted(step)
         lam = schedule.accepted(lam, decrease / predicted if predicted > 0.0 else 1.0)

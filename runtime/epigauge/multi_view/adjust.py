@@ -142,7 +142,8 @@ def bundle_adjust(
     Raises
     ------
     ArgumentError
-        On unknown names, options that exclude one another, or a start of another size.
+        On unknown names, options that exclude one another, a start of another size, or one so
+        degenerate that the steps are undetermined.
 
     References
     ----------
@@ -156,6 +157,19 @@ def bundle_adjust(
         as_choice("damping", damping, _DAMPINGS)
     if gauge is not None and (strategy.gauge is not None or strategy.reference):
         raise ArgumentError("gauge", f"is given with method={method!r}", "a method without its own")
+    if gauge is not None and (isinstance(gauge, type) or not hasattr(gauge, "transformation")):
+        raise ArgumentError("gauge", f"is {gauge!r}", "a gauge, such as eg.gauge.normalized()")
+    act: Any = strategy.damping() if damping is None else _DAMPINGS[damping]()
+    if not isinstance(act, dampings.ByMatrix):
+        # Such a step is made for all parameters, free and unconstrained.
+        if strategy.reference or strategy.constrained:
+            raise ArgumentError(
+                "damping", f"is {damping!r} with method={method!r}", "one that adds a matrix"
+            )
+        if gauge is not None and gauge_mode == "implicit":
+            raise ArgumentError(
+                "gauge_mode", "is 'implicit' with a damping that adds no matrix", "'explicit'"
+            )
     stopping = lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter)
     table = kernels.table(backend)
     if start is None:
@@ -177,7 +191,6 @@ def bundle_adjust(
         Loss(loss, scale_px / frame.scale),
         embedded and strategy.embedded and damping in (None, "covariant"),
     )
-    act: Any = strategy.damping() if damping is None else _DAMPINGS[damping]()
     P, Q = frame.cameras_in(start.P), start.Q
     explicit = strategy.gauge if strategy.explicit else gauge
     if gauge is not None and gauge_mode == "implicit":
@@ -187,15 +200,22 @@ def bundle_adjust(
     first = strategy.gauge or explicit or home
     there = first.transformation(P, Q)
     problem = _problem(strategy, explicit, parts, Q)
-    outcome: lm.Outcome[Any] = lm.minimize(
-        problem,
-        there.apply(P, Q),
-        act,
-        _SCHEDULES[schedule](),
-        stopping,
-        callback,
-        frame.scale**2,
-    )
+    try:
+        outcome: lm.Outcome[Any] = lm.minimize(
+            problem,
+            there.apply(P, Q),
+            act,
+            _SCHEDULES[schedule](),
+            stopping,
+            callback,
+            frame.scale**2,
+        )
+    except np.linalg.LinAlgError:
+        raise ArgumentError(
+            "start",
+            f"leaves the steps of method={method!r} undetermined (singular normal equations)",
+            "cameras with different centres, points away from them, or method='levenberg'",
+        ) from None
     P, Q = outcome.state.P, outcome.state.Q
     if first is home:
         P, Q = there.inverse().apply(P, Q)

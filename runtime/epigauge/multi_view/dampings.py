@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.multi_view.gauge import Gauge
 from epigauge.multi_view.null_space import minimum_norm_step
-from epigauge.multi_view.problem import Linearized, depth_blocks
+from epigauge.multi_view.problem import Linearized
 from epigauge.multi_view.system import BundleSystem
 
 __all__ = [
+    "ByMatrix",
     "Covariant",
     "GaugeInvariant",
     "Implicit",
@@ -28,7 +29,7 @@ Blocks = tuple[Array, Array]
 START = 1e-3
 
 
-class _ByMatrix:
+class ByMatrix:
     """A damping that adds lambda W; W is block diagonal."""
 
     def start(self, system: Linearized) -> float:
@@ -45,7 +46,7 @@ class _ByMatrix:
         return system.damped(lam * cameras, lam * points).solve()
 
 
-class Levenberg(_ByMatrix):
+class Levenberg(ByMatrix):
     """W = I: invariant under orthonormal changes of basis only."""
 
     def start(self, system: Linearized) -> float:
@@ -57,7 +58,7 @@ class Levenberg(_ByMatrix):
         return _identities(system)
 
 
-class Marquardt(_ByMatrix):
+class Marquardt(ByMatrix):
     """W = diag(N): invariant under the scales of cameras and points only."""
 
     def matrix(self, system: Linearized) -> Blocks:
@@ -65,30 +66,30 @@ class Marquardt(_ByMatrix):
         return tuple(_diagonals(blocks) for blocks in (system.U, system.V))  # type: ignore[return-value]
 
 
-class Covariant(_ByMatrix):
+class Covariant(ByMatrix):
     """W = blockdiag(N) + blockdiag(Z^T Z), Z = d log depth: satisfies B03 eq. (8) for every T~."""
 
     def matrix(self, system: Linearized) -> Blocks:
         """Return the blocks of N and of the depths."""
         assert system.problem is not None
         assert system.state is not None
-        cameras, points = depth_blocks(system.problem, system.state)
+        cameras, points = system.problem.depth_blocks(system.state)
         return system.U + cameras, system.V + points
 
 
 @dataclass(frozen=True)
-class Implicit(_ByMatrix):
+class Implicit(ByMatrix):
     """An inner damping as if in another gauge, without moving there (B03 eq. 9).
 
     Parameters
     ----------
-    inner : _ByMatrix
+    inner : ByMatrix
         The damping.
     gauge : Gauge
         Where it is to act.
     """
 
-    inner: _ByMatrix
+    inner: ByMatrix
     gauge: Gauge
 
     def start(self, system: Linearized) -> float:
@@ -109,7 +110,8 @@ class Implicit(_ByMatrix):
         there = self.gauge.transformation(system.state.P, system.state.Q)
         moved = system.transformed(*there.inverse().blocks())
         assert isinstance(moved, Linearized)
-        return moved, there.blocks()
+        P, Q = there.apply(system.state.P, system.state.Q)
+        return replace(moved, state=replace(system.state, P=P, Q=Q)), there.blocks()
 
 
 @dataclass(frozen=True)

@@ -68,13 +68,14 @@ def minimum_norm_step(kernels: Table, system: BundleSystem, P: Array, Q: Array) 
         The solution of least norm.
     """
     p, q = scales(P, Q)
-    weight = system.largest()
+    # Each block in its own measure: scales of cameras and points may be worlds apart.
+    u, v = np.einsum("nii->n", system.U), np.einsum("nii->n", system.V)
     grounded = replace(
         system,
-        U=system.U + weight * p[:, :, None] * p[:, None, :],
-        V=system.V + weight * q[:, :, None] * q[:, None, :],
+        U=system.U + u[:, None, None] * p[:, :, None] * p[:, None, :],
+        V=system.V + v[:, None, None] * q[:, :, None] * q[:, None, :],
     )
     # The cameras' part of the fifteen changes of basis makes the reduced system definite.
     moves = generators(kernels, P, Q)[: P.size]
-    step = grounded.solve_grounded(np.sqrt(weight) * moves)
+    step = grounded.solve_grounded(np.sqrt(np.max(u)) * moves)
     return project_out(kernels, P, Q, step)

@@ -11,13 +11,17 @@ from epigauge.kernels import Table
 from epigauge.multi_view.system import BundleSystem, Layout
 from epigauge.two_view.losses import Loss
 
-__all__ = ["BundleProblem", "BundleState", "Linearized", "depth_blocks"]
+__all__ = ["BundleProblem", "BundleState", "Linearized"]
 
 Array = NDArray[np.float64]
 
 #: Embedded point iterations a trial, and the first and the factor of their damping.
 _POINT_ITERATIONS = 5
 _POINT_LAM, _POINT_FACTOR = 1e-3, 10.0
+
+#: Least weight in the normal equations, of the largest: what only observations without weight (or
+#: beyond a truncated loss) determine stays determined, and does not influence the rest.
+_LEAST_WEIGHT = 1e-12
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,8 @@ class BundleProblem:
         self.kernels, self.layout = kernels, layout
         self.q, self.weights, self.loss = q, weights, loss
         self.embedded = embedded
-        self.floor = 0.5 * float(np.sum(weights)) * 1e-30
+        # Conditioned coordinates are of order one; products of P and Q round a few times.
+        self.floor = 0.5 * float(np.sum(weights)) * 1e-28
 
     def evaluate(self, estimate: tuple[Array, Array]) -> BundleState:
         """Return the state of cameras and points."""
@@ -95,7 +100,7 @@ class BundleProblem:
             rho, first, _ = self.loss(np.sum(r**2, axis=0))
             cost = 0.5 * float(np.sum(self.weights * rho))
         cost = cost if np.isfinite(cost) else float("inf")
-        return BundleState(P, Q, r, J_P, J_Q, np.sqrt(self.weights * first), cost)
+        return BundleState(P, Q, r, J_P, J_Q, np.sqrt(self._effective(first)), cost)
 
     def linearize(self, state: BundleState) -> Linearized:
         """Return the normal equations."""
@@ -130,6 +135,12 @@ class BundleProblem:
         Q = state.Q + step[state.P.size :].reshape(state.Q.shape)
         return P, self.triangulated(P, Q) if self.embedded else Q
 
+    def depth_blocks(self, state: BundleState) -> tuple[Array, Array]:
+        """Return the diagonal blocks of Z^T Z, Z = d log depth / d(P, Q) weighted as residuals."""
+        Z_P, Z_Q = (state.root * Z for Z in self._log_depths(state.P, state.Q))
+        cameras = self.layout.sum_views(Z_P.T[:, :, None] * Z_P.T[:, None, :])
+        return cameras, self.layout.sum_points(Z_Q.T[:, :, None] * Z_Q.T[:, None, :])
+
     def triangulated(self, P: Array, Q: Array) -> Array:
         """Return the points after a few covariantly damped Gauss-Newton iterations of their own."""
         layout = self.layout
@@ -143,7 +154,7 @@ class BundleProblem:
                 B = np.sqrt(weight) * J
                 V = layout.sum_points(np.einsum("ikn,iln->nkl", B, B))
                 g = -layout.sum_points(np.einsum("ikn,in->nk", B, np.sqrt(weight) * r))
-                _, Z = self._log_depths(P, Q)
+                Z = np.sqrt(weight) * self._log_depths(P, Q)[1]
                 damping = V + layout.sum_points(Z.T[:, :, None] * Z.T[:, None, :])
                 step = np.linalg.solve(V + lam[:, None, None] * damping, g[..., None])
                 trial = Q - step[..., 0]
@@ -166,7 +177,10 @@ class BundleProblem:
 
     def _point_costs(self, r: Array) -> tuple[Array, Array]:
         rho, first, _ = self.loss(np.sum(r**2, axis=0))
-        return self.layout.sum_points(self.weights * rho), self.weights * first
+        return self.layout.sum_points(self.weights * rho), self._effective(first)
+
+    def _effective(self, first: Array) -> Array:
+        return np.maximum(self.weights * first, _LEAST_WEIGHT * self.weights.max())
 
     def _project(self, P: Array, Q: Array) -> tuple[Array, Array, Array]:
         cameras, points = self._gathered(P, Q)
@@ -180,11 +194,3 @@ class BundleProblem:
     def _gathered(self, P: Array, Q: Array) -> tuple[Array, Array]:
         cameras = np.ascontiguousarray(P.transpose(1, 2, 0)[:, :, self.layout.view])
         return cameras, np.ascontiguousarray(Q.T[:, self.layout.point])
-
-
-def depth_blocks(problem: BundleProblem, state: BundleState) -> tuple[Array, Array]:
-    """Return the diagonal blocks of Z^T Z, (n, 12, 12) and (m, 4, 4), Z = d log depth / d(P, Q)."""
-    Z_P, Z_Q = problem._log_depths(state.P, state.Q)
-    layout = problem.layout
-    cameras = layout.sum_views(Z_P.T[:, :, None] * Z_P.T[:, None, :])
-    return cameras, layout.sum_points(Z_Q.T[:, :, None] * Z_Q.T[:, None, :])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from epigauge.multi_view import dampings
 from epigauge.multi_view.gauge import Gauge, five_points, normalized, reference_camera, two_cameras
 from epigauge.multi_view.null_space import scales
 from epigauge.multi_view.problem import BundleProblem, BundleState, Linearized
+from epigauge.two_view.free import scatter_constraints
 from epigauge.two_view.parameterizations import Ortho, OrthonormalF
 
 __all__ = ["STRATEGIES", "ExplicitProblem", "RestrictedProblem", "Strategy"]
@@ -85,6 +86,12 @@ class RestrictedProblem(BundleProblem):
             P[1] = self._second_camera(state.P[1], x[1, :7])
         return P, Q
 
+    def depth_blocks(self, state: BundleState) -> tuple[Array, Array]:
+        """Return the diagonal blocks of Z^T Z by the free parameters."""
+        parts = zip(self._bases(state), super().depth_blocks(state), strict=True)
+        cameras, points = (np.swapaxes(B, 1, 2) @ blocks @ B for B, blocks in parts)
+        return cameras, points
+
     def _bases(self, state: BundleState) -> tuple[Array, Array]:
         n, m = len(state.P), len(state.Q)
         cameras = np.tile(np.eye(12), (n, 1, 1))
@@ -108,25 +115,18 @@ class RestrictedProblem(BundleProblem):
 def _factors(P2: Array) -> OrthonormalF:
     """Return U, V, sigma of a canonic camera P' = (u2 v1^T - sigma u1 v2^T | u3) (B&S eq. 5)."""
     U, values, Vt = np.linalg.svd(P2[:, :3])
-    # H = u2 v1^T - sigma u1 v2^T: its left vectors are u2, -u1 and, up to sign, u3.
-    factors = np.column_stack([-U[:, 1], U[:, 0], P2[:, 3]])
-    return OrthonormalF(factors, Vt.T, np.asarray(values[1] / values[0]))
+    # H = u2 v1^T - sigma u1 v2^T: its left vectors are u2, -u1 and, up to sign, u3. The singular
+    # value one belongs to u2; it is the second where a step has taken sigma beyond one.
+    one, other = (0, 1) if abs(values[0] - 1.0) <= abs(values[1] - 1.0) else (1, 0)
+    factors = np.column_stack([-U[:, other], U[:, one], P2[:, 3]])
+    return OrthonormalF(factors, Vt[[one, other, 2]].T, np.asarray(values[other] / values[one]))
 
 
 def _normalization_constraints(system: Linearized, state: BundleState) -> Linearized:
     """Add first-order constraints: unit norms, and sum Q Q^T fixed (ten of them)."""
-    from dataclasses import replace
-
     weight = float(np.mean(np.einsum("nii->ni", system.V)))
     p, q = scales(state.P, state.Q)
-    columns = []
-    for a in range(4):
-        for b in range(a, 4):
-            column = np.zeros_like(state.Q)
-            column[:, a] += state.Q[:, b]
-            column[:, b] += state.Q[:, a]
-            columns.append(column)
-    border = np.sqrt(weight) * np.stack(columns, axis=2)
+    border = np.sqrt(weight) * scatter_constraints(state.Q)
     return replace(
         system,
         U=system.U + weight * p[:, :, None] * p[:, None, :],

@@ -99,8 +99,12 @@ class BundleSystem:
         return np.concatenate([self.g_cameras.ravel(), self.g_points.ravel()])
 
     def largest(self) -> float:
-        """Return the largest diagonal entry."""
-        return float(max(np.einsum("nii->ni", self.U).max(), np.einsum("nii->ni", self.V).max()))
+        """Return the largest mean diagonal entry of a block.
+
+        Unlike the largest entry, an orthonormal change of basis does not change it.
+        """
+        traces = (np.einsum("nii->n", blocks) / blocks.shape[1] for blocks in (self.U, self.V))
+        return float(max(trace.max() for trace in traces))
 
     def decrement(self) -> float:
         """Return infinity: J^T J is singular along the gauge."""

@@ -186,10 +186,8 @@ class Reconstruction:
     Q: Array
 
     def __post_init__(self) -> None:
-        if self.P.ndim != 3 or self.P.shape[1:] != (3, 4) or not np.isfinite(self.P).all():
-            raise ArgumentError("P", f"has shape {self.P.shape}", "finite cameras, (n, 3, 4)")
-        if self.Q.ndim != 2 or self.Q.shape[1] != 4 or not np.isfinite(self.Q).all():
-            raise ArgumentError("Q", f"has shape {self.Q.shape}", "finite points, (m, 4)")
+        object.__setattr__(self, "P", _homogeneous("P", self.P, (3, 4)))
+        object.__setattr__(self, "Q", _homogeneous("Q", self.Q, (4,)))
 
     def project(self, tracks: Tracks) -> Array:
         """Return the predicted pixels of all observations, shape (N, 2), in the tracks' order."""
@@ -199,6 +197,19 @@ class Reconstruction:
     def rms_px(self, tracks: Tracks) -> float:
         """Return sqrt(sum of squared residual coordinates / (2 N))."""
         return float(np.sqrt(np.mean((tracks.xy - self.project(tracks)) ** 2)))
+
+
+def _homogeneous(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Return homogeneous matrices or vectors, of any scale but zero."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "iuf" or array.shape[1:] != shape or array.ndim == 0:
+        needed = ", ".join(map(str, shape))
+        raise ArgumentError(name, f"is {array.dtype} {array.shape}", f"real numbers, (n, {needed})")
+    rows = array.reshape(len(array), -1)
+    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1) | ~rows.any(axis=1))
+    if len(bad):
+        raise ArgumentError(name, f"is zero or not finite in row {bad[0]}", "finite, not all zero")
+    return array.astype(np.float64, copy=False)
 
 
 def _indices(name: str, value: ArrayLike) -> Indices:

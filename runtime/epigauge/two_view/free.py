@@ -13,7 +13,13 @@ from epigauge.two_view.joint import first_structure, reweighted
 from epigauge.two_view.losses import Loss
 from epigauge.two_view.parameterizations import factorize
 
-__all__ = ["FreeProblem", "FreeState", "fundamental_from_cameras", "normalized_basis"]
+__all__ = [
+    "FreeProblem",
+    "FreeState",
+    "fundamental_from_cameras",
+    "normalized_basis",
+    "scatter_constraints",
+]
 
 Array = NDArray[np.float64]
 Estimate = tuple[Array, Array]  # cameras (2, 3, 4) and points (4, m)
@@ -137,7 +143,7 @@ class FreeProblem:
                 P = state.cameras[k].ravel()
                 U[12 * k : 12 * k + 12, 12 * k : 12 * k + 12] += weight * np.outer(P, P)
             V = V + weight * np.einsum("km,lm->mkl", state.Q, state.Q)
-            border = np.sqrt(weight) * _scatter_constraints(state.Q)
+            border = np.sqrt(weight) * scatter_constraints(state.Q.T)
         return Arrow(
             U=U,
             W=np.einsum("pim,ikm->mpk", A, J_Q),
@@ -160,13 +166,27 @@ class FreeProblem:
         return normalized_basis(cameras, Q) if self.normalized else (cameras, Q)
 
 
-def _scatter_constraints(Q: Array) -> Array:
-    """Return the ten first-order constraints sum (Q dQ^T + dQ Q^T) = 0, shape (m, 4, 10)."""
+def scatter_constraints(Q: Array) -> Array:
+    """Return the ten first-order constraints sum (Q dQ^T + dQ Q^T) = 0.
+
+    Weighted such that the sum of their squares is that of the symmetric matrix' entries, which an
+    orthonormal change of basis leaves alone.
+
+    Parameters
+    ----------
+    Q : ndarray, shape (m, 4)
+        Points.
+
+    Returns
+    -------
+    ndarray, shape (m, 4, 10)
+        Coefficients of dQ.
+    """
     columns = []
     for a in range(4):
         for b in range(a, 4):
-            column = np.zeros((Q.shape[1], 4))
-            column[:, a] += Q[b]
-            column[:, b] += Q[a]
-            columns.append(column)
+            column = np.zeros_like(Q)
+            column[:, a] += Q[:, b]
+            column[:, b] += Q[:, a]
+            columns.append(column if a == b else np.sqrt(2.0) * column)
     return np.stack(columns, axis=2)
