@@ -11,6 +11,7 @@ from epigauge import lm
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table, table
 from epigauge.linear import Dense, Levenberg
+from epigauge.multi_view.dampings import Covariant
 from epigauge.multi_view.gauge import normalized
 from epigauge.multi_view.problem import BundleProblem
 from epigauge.multi_view.system import Layout
@@ -69,7 +70,9 @@ class Frame:
         return moved
 
 
-def initialize(tracks: Tracks, *, backend: str | None = None) -> Reconstruction:
+def initialize(
+    tracks: Tracks, *, incremental: bool = False, backend: str | None = None
+) -> Reconstruction:
     """Reconstruct from two views with strong geometry and register the other cameras in turn.
 
     Robust against gross errors in some tracks: two-view geometry, resection and triangulation use
@@ -79,6 +82,9 @@ def initialize(tracks: Tracks, *, backend: str | None = None) -> Reconstruction:
     ----------
     tracks : Tracks
         Observations.
+    incremental : bool
+        Adjust everything known, by a few robust steps, whenever a camera is registered: slower,
+        but errors do not add up over long sequences.
     backend : {"c", "numpy", "casadi"}, optional
         Where the formulas are computed.
 
@@ -98,6 +104,8 @@ def initialize(tracks: Tracks, *, backend: str | None = None) -> Reconstruction:
     builder.begin(*_best_pair(tracks, frame))
     while not builder.registered.all():
         builder.register(builder.next_view())
+        if incremental:
+            builder.adjust()
     return Reconstruction(frame.cameras_out(builder.P), builder.Q)
 
 
@@ -193,6 +201,24 @@ class _Builder:
         self.P[view] = resect(self.kernels, self.q[:, rows], self.Q[self.tracks.point[rows]].T)
         self.registered[view] = True
         self._triangulate()
+        self._spread()
+
+    def adjust(self) -> None:
+        """Adjust all registered cameras and known points by a few robust covariant steps."""
+        rows = np.flatnonzero(self.registered[self.tracks.view] & self.known[self.tracks.point])
+        views, local_views = np.unique(self.tracks.view[rows], return_inverse=True)
+        points, local_points = np.unique(self.tracks.point[rows], return_inverse=True)
+        layout = Layout(local_views, local_points, len(views), len(points))
+        q = np.ascontiguousarray(self.q[:, rows])
+        problem = BundleProblem(self.kernels, layout, q, np.ones(len(rows)), Loss(), embedded=True)
+        estimate = self.P[views], self.Q[points]
+        scale = EFFICIENT["cauchy"] * robust_scale(
+            np.linalg.norm(problem.evaluate(estimate).r, axis=0)
+        )
+        problem.loss = Loss("cauchy", max(scale, 1e-12))
+        stopping = lm.Stopping(ftol=1e-3, xtol=0.0, gtol=0.0, max_iter=5)
+        found = lm.minimize(problem, estimate, Covariant(), lm.Classic(), stopping)
+        self.P[views], self.Q[points] = found.state.P, found.state.Q
         self._spread()
 
     def _triangulate(self) -> None:

@@ -21,7 +21,7 @@ _POINT_LAM, _POINT_FACTOR = 1e-3, 10.0
 
 #: Least weight in the normal equations, of the largest: what only observations without weight (or
 #: beyond a truncated loss) determine stays determined, and does not influence the rest.
-_LEAST_WEIGHT = 1e-12
+_LEAST_WEIGHT = 1e-8
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,10 @@ class BundleProblem:
     def depth_blocks(self, state: BundleState) -> tuple[Array, Array]:
         """Return the diagonal blocks of Z^T Z, Z = d log depth / d(P, Q) weighted as residuals."""
         Z_P, Z_Q = (state.root * Z for Z in self._log_depths(state.P, state.Q))
-        cameras = self.layout.sum_views(Z_P.T[:, :, None] * Z_P.T[:, None, :])
+        # A depth depends on the last row of its camera only.
+        row = Z_P[8:].T
+        cameras = np.zeros((self.layout.n_views, 12, 12))
+        cameras[:, 8:, 8:] = self.layout.sum_views(row[:, :, None] * row[:, None, :])
         return cameras, self.layout.sum_points(Z_Q.T[:, :, None] * Z_Q.T[:, None, :])
 
     def triangulated(self, P: Array, Q: Array) -> Array:
@@ -156,8 +159,7 @@ class BundleProblem:
                 g = -layout.sum_points(np.einsum("ikn,in->nk", B, np.sqrt(weight) * r))
                 Z = np.sqrt(weight) * self._log_depths(P, Q)[1]
                 damping = V + layout.sum_points(Z.T[:, :, None] * Z.T[:, None, :])
-                step = np.linalg.solve(V + lam[:, None, None] * damping, g[..., None])
-                trial = Q - step[..., 0]
+                trial = Q - _solved(V + lam[:, None, None] * damping, g)
                 r_trial, _, J_trial = self._project(P, trial)
                 cost_trial, weight_trial = self._point_costs(r_trial)
                 better = cost_trial < cost
@@ -194,3 +196,11 @@ class BundleProblem:
     def _gathered(self, P: Array, Q: Array) -> tuple[Array, Array]:
         cameras = np.ascontiguousarray(P.transpose(1, 2, 0)[:, :, self.layout.view])
         return cameras, np.ascontiguousarray(Q.T[:, self.layout.point])
+
+
+def _solved(A: Array, b: Array) -> Array:
+    """Return A^-1 b for each of many symmetric systems, A^+ b where one is singular to rounding."""
+    try:
+        return np.asarray(np.linalg.solve(A, b[..., None])[..., 0])
+    except np.linalg.LinAlgError:
+        return np.asarray((np.linalg.pinv(A, hermitian=True) @ b[..., None])[..., 0])
