@@ -28,6 +28,9 @@ Blocks = tuple[Array, Array]
 #: First lambda, relative to the size of the system where the damping does not scale with it.
 START = 1e-3
 
+#: Least diagonal entry of lambda diag(N), of the mean of its block.
+_LEAST = 1e-6
+
 
 class ByMatrix:
     """A damping that adds lambda W; W is block diagonal."""
@@ -76,6 +79,10 @@ class Covariant(ByMatrix):
         cameras, points = system.problem.depth_blocks(system.state)
         return system.U + cameras, system.V + points
 
+    def step(self, system: Linearized, lam: float) -> Array:
+        """Return -(N + lambda W)^-1 g, solved where W = I."""
+        return _whitened_step(system, self.matrix(system), lam)
+
 
 @dataclass(frozen=True)
 class Implicit(ByMatrix):
@@ -105,6 +112,10 @@ class Implicit(ByMatrix):
             np.swapaxes(points, 1, 2) @ W_points @ points,
         )
 
+    def step(self, system: Linearized, lam: float) -> Array:
+        """Return -(N + lambda W)^-1 g, solved where W = I."""
+        return _whitened_step(system, self.matrix(system), lam)
+
     def _moved(self, system: Linearized) -> tuple[Linearized, Blocks]:
         assert system.state is not None
         there = self.gauge.transformation(system.state.P, system.state.Q)
@@ -116,15 +127,19 @@ class Implicit(ByMatrix):
 
 @dataclass(frozen=True)
 class GaugeInvariant:
-    """Table 1 of B03 as printed; its W^-1 has rank one a block, so the step is taken in dual form.
+    """Table 1 of B03; its W^-1 may be singular, so the step is taken in dual form.
 
-    delta = -R^T (R N R^T + lambda I)^-1 R g with R = diag(M_1, M_1, M_1, ..., S, ..., S). The
-    constrained maximisation puts all weight on the top eigenvector of a Gram matrix of gradients.
+    delta = -R^T (R N R^T + lambda I)^-1 R g with R = diag(M_1, M_1, M_1, ..., S, ..., S), which
+    depends on R^T R only. Each block maximises sum |R g_k|^2 = <R^T R, G> over the gradients g_k,
+    G = sum g_k g_k^T, under a normalisation with b = 12 (cameras) or 4 (points).
 
     Parameters
     ----------
     norm : {"product", "factor"}
-        What is normalised: |R^T R|^2 as printed in Table 1, or |vec R|^2 as its solution suggests.
+        What is normalised. "product": |R^T R|^2 = b as Table 1 prints, whose maximiser is
+        R^T R = sqrt(b) G / |G| (Cauchy-Schwarz). "factor": |vec R|^2 = b, for which the paper's
+        solution by a singular vector is right; R^T R = b v v^T of rank one, v the top eigenvector
+        of G: each camera moves in three directions, all points along one.
     """
 
     norm: str = "product"
@@ -139,25 +154,22 @@ class GaugeInvariant:
         reduced = system.transformed(B_cameras, B_points)
         cameras, points = _identities(reduced)
         y = reduced.damped(lam * cameras, lam * points).solve()
-        x, s = reduced.split(y)
-        moved = (np.einsum("nij,nj->ni", B_cameras, x), np.einsum("nij,nj->ni", B_points, s))
-        return np.concatenate([moved[0].ravel(), moved[1].ravel()])
+        return _mapped((B_cameras, B_points), *reduced.split(y))
 
     def directions(self, system: Linearized) -> Blocks:
-        """Return R^T: (n, 12, 3) and (m, 4, 1)."""
+        """Return R^T: (n, 12, 3 k) and (m, 4, k), k = 4 for "product" and 1 for "factor"."""
         n, m = len(system.g_cameras), len(system.g_points)
         rows = system.g_cameras.reshape(n, 3, 4)
-        cameras = np.zeros((n, 3, 4, 3))
-        for i in range(n):
-            direction = self._length(12) * _top_eigenvector(rows[i].T @ rows[i])
-            for k in range(3):
-                cameras[i, k, :, k] = direction
-        direction = self._length(4) * _top_eigenvector(system.g_points.T @ system.g_points)
-        return cameras.reshape(n, 12, 3), np.tile(direction[:, None], (m, 1, 1))
+        cameras = [np.kron(np.eye(3), self._block(g.T @ g, 12)) for g in rows]
+        points = self._block(system.g_points.T @ system.g_points, 4)
+        return np.stack(cameras), np.tile(points, (m, 1, 1))
 
-    def _length(self, b: int) -> float:
-        # r r^T has Frobenius norm |r|^2.
-        return float(b**0.25 if self.norm == "product" else b**0.5)
+    def _block(self, gram: Array, b: int) -> Array:
+        values, vectors = np.linalg.eigh(gram)
+        if self.norm == "factor":
+            return np.asarray(np.sqrt(b) * vectors[:, 3:])
+        size = max(float(np.linalg.norm(values)), np.finfo(float).tiny)
+        return np.asarray(vectors * np.sqrt(np.sqrt(b) * np.maximum(values, 0.0) / size))
 
 
 class PseudoInverse:
@@ -184,9 +196,27 @@ def _identities(system: BundleSystem) -> Blocks:
     return np.broadcast_to(np.eye(a), (n, a, a)), np.broadcast_to(np.eye(b), (m, b, b))
 
 
+def _whitened_step(system: Linearized, W: Blocks, lam: float) -> Array:
+    """Return -(N + lambda W)^-1 g by parameters in which W = I.
+
+    There its condition is about |W^-1 N| / lambda whatever the basis; a basis far from the one
+    that suits the problem would cost digits, and the step its invariance.
+    """
+    roots = [np.swapaxes(np.linalg.cholesky(blocks), 1, 2) for blocks in W]
+    whitening = (np.linalg.inv(roots[0]), np.linalg.inv(roots[1]))
+    white = system.transformed(*whitening)
+    cameras, points = _identities(white)
+    return _mapped(whitening, *white.split(white.damped(lam * cameras, lam * points).solve()))
+
+
+def _mapped(blocks: Blocks, cameras: Array, points: Array) -> Array:
+    """Return blocks times a step as one vector."""
+    x, y = np.einsum("nij,nj->ni", blocks[0], cameras), np.einsum("nij,nj->ni", blocks[1], points)
+    return np.concatenate([x.ravel(), y.ravel()])
+
+
 def _diagonals(blocks: Array) -> Array:
-    return blocks * np.eye(blocks.shape[1])
-
-
-def _top_eigenvector(gram: Array) -> Array:
-    return np.asarray(np.linalg.eigh(gram)[1][:, -1])
+    diagonals = np.einsum("nii->ni", blocks)
+    # A point on an axis, as in the five-point gauge, has a zero for its scale.
+    diagonals = np.maximum(diagonals, _LEAST * diagonals.mean(axis=1, keepdims=True))
+    return np.asarray(diagonals[:, :, None] * np.eye(blocks.shape[1]))

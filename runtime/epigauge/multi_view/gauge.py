@@ -243,10 +243,14 @@ class five_points:
     def choose(Q: Array, candidates: int = 12) -> list[int]:
         """Return five points whose smallest 4x4 minor is the largest among some candidates.
 
-        The candidates are spread as far as possible in the normalised basis.
+        The candidates are spread as far as possible in the normalised basis. All that is compared
+        are cosines and minors there, so that the choice is the same in every basis.
         """
         moved = normalized().transformation(np.zeros((0, 3, 4)), Q).apply(np.zeros((0, 3, 4)), Q)[1]
-        spread = [int(np.argmax(np.abs(moved[:, 0])))]
+        # The loneliest point, of the smallest sum of fourth powers of cosines with all others.
+        products = (moved[:, :, None] * moved[:, None, :]).reshape(-1, 16)
+        loneliness = np.einsum("ja,ab,jb->j", products, products.T @ products, products)
+        spread = [int(np.argmin(loneliness))]
         rest = moved.copy()
         while len(spread) < min(candidates, len(Q)):
             nearest = np.abs(rest @ moved[spread].T).max(axis=1)

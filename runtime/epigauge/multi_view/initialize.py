@@ -20,7 +20,7 @@ from epigauge.two_view.geometry import canonical_cameras
 from epigauge.two_view.losses import EFFICIENT, Loss, robust_scale
 from epigauge.two_view.refine import refine_fundamental
 
-__all__ = ["Frame", "initialize"]
+__all__ = ["Frame", "initialize", "intersected", "resect"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -230,7 +230,7 @@ class _Builder:
         layout = Layout(self.tracks.view[rows], local, self.tracks.n_views, len(points))
         q = np.ascontiguousarray(self.q[:, rows])
         problem = BundleProblem(self.kernels, layout, q, np.ones(len(rows)), Loss())
-        self.Q[points] = _intersected(self.P, self.Q[points], self.known[points], problem)
+        self.Q[points] = _triangulated(self.P, self.Q[points], self.known[points], problem)
         self.known[points] = True
 
     def _spread(self) -> None:
@@ -241,8 +241,8 @@ class _Builder:
         )
 
 
-def _intersected(P: Array, Q: Array, known: NDArray[np.bool_], problem: BundleProblem) -> Array:
-    """Return points triangulated linearly where new, then refined, with a robust loss."""
+def intersected(P: Array, problem: BundleProblem) -> Array:
+    """Return the points (m, 4) of least algebraic error: the lines of sight's linear meeting."""
     layout, q = problem.layout, problem.q
     cameras = P[layout.view]
     gram = np.zeros((len(layout.view), 4, 4))
@@ -250,7 +250,12 @@ def _intersected(P: Array, Q: Array, known: NDArray[np.bool_], problem: BundlePr
         row = q[k][:, None] * cameras[:, 2] - cameras[:, k]
         row = row / np.linalg.norm(row, axis=1, keepdims=True)
         gram += row[:, :, None] * row[:, None, :]
-    linear = np.linalg.eigh(layout.sum_points(gram))[1][:, :, 0]
+    return np.asarray(np.linalg.eigh(layout.sum_points(gram))[1][:, :, 0])
+
+
+def _triangulated(P: Array, Q: Array, known: NDArray[np.bool_], problem: BundleProblem) -> Array:
+    """Return points triangulated linearly where new, then refined, with a robust loss."""
+    linear = intersected(P, problem)
     Q = np.where(known[:, None], Q, linear)
     with np.errstate(divide="ignore", invalid="ignore"):
         residuals = np.linalg.norm(problem.evaluate((P, linear)).r, axis=0)

@@ -182,7 +182,8 @@ class BundleProblem:
         return self.layout.sum_points(self.weights * rho), self._effective(first)
 
     def _effective(self, first: Array) -> Array:
-        return np.maximum(self.weights * first, _LEAST_WEIGHT * self.weights.max())
+        least = _LEAST_WEIGHT * float(np.max(self.weights))
+        return np.asarray(np.maximum(self.weights * first, least))
 
     def _project(self, P: Array, Q: Array) -> tuple[Array, Array, Array]:
         cameras, points = self._gathered(P, Q)

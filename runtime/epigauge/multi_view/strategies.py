@@ -193,7 +193,10 @@ STRATEGIES: dict[str, Strategy] = {
     "kanatani": Strategy(
         dampings.Levenberg, "all free, periodically normalised", normalized(), True, every=5
     ),
-    "gauge_invariant": Strategy(dampings.GaugeInvariant, "Table 1 of the 2003 paper"),
+    "gauge_invariant": Strategy(dampings.GaugeInvariant, "Table 1 of the 2003 paper as printed"),
+    "gauge_invariant_factor": Strategy(
+        lambda: dampings.GaugeInvariant("factor"), "Table 1 solved by a singular vector: rank one"
+    ),
     "covariant": Strategy(
         dampings.Covariant, "covariant damping, points re-triangulated", embedded=True
     ),

@@ -151,6 +151,12 @@ class BundleSystem:
             W=np.swapaxes(B_view, 1, 2) @ self.W @ B_point,
             g_cameras=np.einsum("nij,ni->nj", B_cameras, self.g_cameras),
             g_points=np.einsum("nij,ni->nj", B_points, self.g_points),
+            border=None
+            if self.border is None
+            else (
+                np.swapaxes(B_cameras, 1, 2) @ self.border[0],
+                np.swapaxes(B_points, 1, 2) @ self.border[1],
+            ),
         )
 
     def solve(self) -> Array:

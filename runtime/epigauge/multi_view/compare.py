@@ -1,0 +1,140 @@
+"""All methods on the same tracks from the same start."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from epigauge import lm
+from epigauge._arguments import as_choice
+from epigauge.errors import ArgumentError
+from epigauge.multi_view.adjust import bundle_adjust
+from epigauge.multi_view.initialize import initialize
+from epigauge.multi_view.strategies import STRATEGIES
+from epigauge.multi_view.tracks import Reconstruction, Tracks
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["ComparedMethod", "Comparison", "compare"]
+
+
+@dataclass(frozen=True)
+class ComparedMethod:
+    """How one method did; the fields are those of `BundleResult`.
+
+    Attributes
+    ----------
+    seconds : float
+        Time of the adjustment, the common start not counted.
+    """
+
+    method: str
+    nfev: int
+    nit: int
+    rms_px: float
+    cost: float
+    seconds: float
+    status: int
+    success: bool
+    message: str
+    history: tuple[lm.Row, ...] = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Methods side by side.
+
+    Attributes
+    ----------
+    rows : tuple of ComparedMethod
+        One a method, in the order asked for.
+    start_rms_px : float
+        RMS of the common start.
+    """
+
+    rows: tuple[ComparedMethod, ...]
+    start_rms_px: float
+
+    def to_markdown(self) -> str:
+        """Return a table in Markdown."""
+        head = ("method", "evaluations", "steps", "RMS (px)", "cost (px^2)", "seconds", "end")
+        lines = ["| " + " | ".join(head) + " |", "|---|" + "---:|" * 5 + "---|"]
+        lines += [
+            f"| {row.method} | {row.nfev} | {row.nit} | {row.rms_px:.6f} | {row.cost:.8g} "
+            f"| {row.seconds:.2f} | {row.message} |"
+            for row in self.rows
+        ]
+        return "\n".join(lines) + "\n"
+
+    def plot(self, title: str = "") -> Figure:
+        """Return the picture of `plots.plot_comparison`."""
+        from epigauge.plots import plot_comparison
+
+        return plot_comparison(self, title)
+
+
+def compare(
+    tracks: Tracks,
+    methods: str | Sequence[str] = "all",
+    start: Reconstruction | None = None,
+    *,
+    on_method: Callable[[str], object] | None = None,
+    **options: Any,
+) -> Comparison:
+    """Adjust the same tracks from the same start by several methods.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Observations.
+    methods : "all" or sequence of str
+        Names of strategies, see `bundle_adjust`.
+    start : Reconstruction, optional
+        Where all begin; by default `initialize(tracks)`.
+    on_method : callable, optional
+        Called with the name of each method before it runs.
+    **options
+        For `bundle_adjust`, the same for all.
+
+    Returns
+    -------
+    Comparison
+        Rows of plain data; `to_markdown()`, `plot()`.
+
+    Raises
+    ------
+    ArgumentError
+        On unknown or repeated names, and as `bundle_adjust`.
+    """
+    names = list(STRATEGIES) if methods == "all" else methods
+    if isinstance(names, str) or not names or len(set(names)) != len(names):
+        raise ArgumentError("methods", f"is {methods!r}", '"all" or a list of different names')
+    for name in names:
+        as_choice("methods", name, STRATEGIES)
+    if start is None:
+        start = initialize(tracks, backend=options.get("backend"))
+    rows = []
+    for name in names:
+        if on_method is not None:
+            on_method(name)
+        begin = time.perf_counter()
+        result = bundle_adjust(tracks, start, method=name, **options)
+        seconds = time.perf_counter() - begin
+        rows.append(
+            ComparedMethod(
+                name,
+                result.nfev,
+                result.nit,
+                result.rms_px,
+                result.cost,
+                seconds,
+                result.status,
+                result.success,
+                result.message,
+                result.history,
+            )
+        )
+    return Comparison(tuple(rows), start.rms_px(tracks))
