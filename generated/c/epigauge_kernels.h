@@ -571,6 +571,49 @@ EG_EXPORT void eg_foot_point_derivative(
     double *EG_RESTRICT q2_hat,
     double *EG_RESTRICT dd_dF);
 
+EG_EXPORT void eg_foot_point_each(
+    ptrdiff_t n,
+    const double *EG_RESTRICT R1,
+    const double *EG_RESTRICT R2,
+    const double *EG_RESTRICT s,
+    const double *EG_RESTRICT b1,
+    const double *EG_RESTRICT b2,
+    const double *EG_RESTRICT f_array,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    double *EG_RESTRICT multiplier,
+    double *EG_RESTRICT last_change,
+    double *EG_RESTRICT d);
+
+EG_EXPORT void eg_foot_point_safe_each(
+    ptrdiff_t n,
+    const double *EG_RESTRICT R1,
+    const double *EG_RESTRICT R2,
+    const double *EG_RESTRICT s,
+    const double *EG_RESTRICT b1,
+    const double *EG_RESTRICT b2,
+    const double *EG_RESTRICT f_array,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    double *EG_RESTRICT multiplier,
+    double *EG_RESTRICT last_change,
+    double *EG_RESTRICT d);
+
+EG_EXPORT void eg_foot_point_derivative_each(
+    ptrdiff_t n,
+    const double *EG_RESTRICT R1,
+    const double *EG_RESTRICT R2,
+    const double *EG_RESTRICT s,
+    const double *EG_RESTRICT b1,
+    const double *EG_RESTRICT b2,
+    const double *EG_RESTRICT f_array,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT l_array,
+    double *EG_RESTRICT q1_hat,
+    double *EG_RESTRICT q2_hat,
+    double *EG_RESTRICT dd_dF);
+
 EG_EXPORT void eg_reprojection_gauss_newton(
     ptrdiff_t n,
     const double *EG_RESTRICT R1,

@@ -408,6 +408,348 @@ EG_EXPORT void eg_foot_point_derivative(
     }
 }
 
+/* Formula: multiplier l of the foot point by 2 passes of bracketed Newton from the Sampson
+   correction, its last change, and the signed distance d = l |n|; each match with its own
+   frame.
+   Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,)
+   Outputs: multiplier (), last_change (), d ()
+   Operations: 216, temporaries: 56. */
+EG_EXPORT void eg_foot_point_each(
+    ptrdiff_t n,
+    const double *EG_RESTRICT R1,
+    const double *EG_RESTRICT R2,
+    const double *EG_RESTRICT s,
+    const double *EG_RESTRICT b1,
+    const double *EG_RESTRICT b2,
+    const double *EG_RESTRICT f_array,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    double *EG_RESTRICT multiplier,
+    double *EG_RESTRICT last_change,
+    double *EG_RESTRICT d)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double R1_00 = R1[i];
+        const double R1_01 = R1[n + i];
+        const double R1_10 = R1[2*n + i];
+        const double R1_11 = R1[3*n + i];
+        const double R2_00 = R2[i];
+        const double R2_01 = R2[n + i];
+        const double R2_10 = R2[2*n + i];
+        const double R2_11 = R2[3*n + i];
+        const double s0 = s[i];
+        const double s1 = s[n + i];
+        const double b1_0 = b1[i];
+        const double b1_1 = b1[n + i];
+        const double b2_0 = b2[i];
+        const double b2_1 = b2[n + i];
+        const double f = f_array[i];
+        const double q1_0 = q1[i];
+        const double q1_1 = q1[n + i];
+        const double q2_0 = q2[i];
+        const double q2_1 = q2[n + i];
+        const double pole = 0.9999999999999858/(1e-140 + s0);
+        const double a1_0 = R1_00*q1_0 + R1_10*q1_1;
+        const double a1_1 = R1_01*q1_0 + R1_11*q1_1;
+        const double a2_0 = R2_00*q2_0 + R2_10*q2_1;
+        const double a2_1 = R2_01*q2_0 + R2_11*q2_1;
+        const double t0 = b1_0 + a2_0*s0;
+        const double t1 = b1_1 + a2_1*s1;
+        const double C0 = f + a1_0*t0 + a1_1*t1 + a2_0*b2_0 + a2_1*b2_1;
+        const double t2 = b2_0 + a1_0*s0;
+        const double t4 = t0 + t2;
+        const double hh0 = 0.5*t4*t4;
+        const double t5 = b1_0 + a2_0*s0 - t2;
+        const double hh1 = 0.5*t5*t5;
+        const double t3 = b2_1 + a1_1*s1;
+        const double t6 = t1 + t3;
+        const double hh2 = 0.5*t6*t6;
+        const double t7 = b1_1 + a2_1*s1 - t3;
+        const double hh3 = 0.5*t7*t7;
+        const double start = C0/(1e-300 + hh0 + hh1 + hh2 + hh3);
+        double l = ((-pole - start)*(pole - start) > 0.0 ? 0.0 : start);
+        double low = (C0 > 0.0 ? 0.0 : -pole);
+        double high = (C0 > 0.0 ? pole : 0.0);
+        double change = 0.0;
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double inverse0 = 1.0/(above0*below0);
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double t9 = l*s1;
+            const double below1 = 1.0 - t9;
+            const double above1 = 1.0 + t9;
+            const double inverse1 = 1.0/(above1*below1);
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double t10 = 0.5*t8;
+            const double t11 = 0.5*t9;
+            const double value = C0 - hh0*l*r0*r0*(1.0 + t10) - hh1*l*r1*r1*(1.0 - t10) - hh2*l*r2*r2*(1.0 + t11) - hh3*l*r3*r3*(1.0 - t11);
+            const double high_new = (value > 0.0 ? high : l);
+            const double low_new = (value > 0.0 ? l : low);
+            const double step = value/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t12 = l + step;
+            const double moved = ((high_new - t12)*(low_new - t12) > 0.0 ? 0.5*high_new + 0.5*low_new : t12);
+            const double t13 = moved - l;
+            l = moved;
+            low = low_new;
+            high = high_new;
+            change = t13;
+        }
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double inverse0 = 1.0/(above0*below0);
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double t9 = l*s1;
+            const double below1 = 1.0 - t9;
+            const double above1 = 1.0 + t9;
+            const double inverse1 = 1.0/(above1*below1);
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double t10 = 0.5*t8;
+            const double t11 = 0.5*t9;
+            const double value = C0 - hh0*l*r0*r0*(1.0 + t10) - hh1*l*r1*r1*(1.0 - t10) - hh2*l*r2*r2*(1.0 + t11) - hh3*l*r3*r3*(1.0 - t11);
+            const double high_new = (value > 0.0 ? high : l);
+            const double low_new = (value > 0.0 ? l : low);
+            const double step = value/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t12 = l + step;
+            const double moved = ((high_new - t12)*(low_new - t12) > 0.0 ? 0.5*high_new + 0.5*low_new : t12);
+            const double t13 = moved - l;
+            l = moved;
+            low = low_new;
+            high = high_new;
+            change = t13;
+        }
+        const double t14 = l*s0;
+        const double below0 = 1.0 - t14;
+        const double above0 = 1.0 + t14;
+        const double inverse0 = 1.0/(above0*below0);
+        const double r0 = below0*inverse0;
+        const double r1 = above0*inverse0;
+        const double t15 = l*s1;
+        const double below1 = 1.0 - t15;
+        const double above1 = 1.0 + t15;
+        const double inverse1 = 1.0/(above1*below1);
+        const double r2 = below1*inverse1;
+        const double r3 = above1*inverse1;
+        multiplier[i] = l;
+        last_change[i] = change;
+        d[i] = l*sqrt(hh0*r0*r0 + hh1*r1*r1 + hh2*r2*r2 + hh3*r3*r3);
+    }
+}
+
+/* Formula: multiplier l of the foot point by 100 passes of bracketed Newton from the Sampson
+   correction, its last change, and the signed distance d = l |n|; each match with its own
+   frame.
+   Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,)
+   Outputs: multiplier (), last_change (), d ()
+   Operations: 6488, temporaries: 56. */
+EG_EXPORT void eg_foot_point_safe_each(
+    ptrdiff_t n,
+    const double *EG_RESTRICT R1,
+    const double *EG_RESTRICT R2,
+    const double *EG_RESTRICT s,
+    const double *EG_RESTRICT b1,
+    const double *EG_RESTRICT b2,
+    const double *EG_RESTRICT f_array,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    double *EG_RESTRICT multiplier,
+    double *EG_RESTRICT last_change,
+    double *EG_RESTRICT d)
+{
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double R1_00 = R1[i];
+        const double R1_01 = R1[n + i];
+        const double R1_10 = R1[2*n + i];
+        const double R1_11 = R1[3*n + i];
+        const double R2_00 = R2[i];
+        const double R2_01 = R2[n + i];
+        const double R2_10 = R2[2*n + i];
+        const double R2_11 = R2[3*n + i];
+        const double s0 = s[i];
+        const double s1 = s[n + i];
+        const double b1_0 = b1[i];
+        const double b1_1 = b1[n + i];
+        const double b2_0 = b2[i];
+        const double b2_1 = b2[n + i];
+        const double f = f_array[i];
+        const double q1_0 = q1[i];
+        const double q1_1 = q1[n + i];
+        const double q2_0 = q2[i];
+        const double q2_1 = q2[n + i];
+        const double pole = 0.9999999999999858/(1e-140 + s0);
+        const double a1_0 = R1_00*q1_0 + R1_10*q1_1;
+        const double a1_1 = R1_01*q1_0 + R1_11*q1_1;
+        const double a2_0 = R2_00*q2_0 + R2_10*q2_1;
+        const double a2_1 = R2_01*q2_0 + R2_11*q2_1;
+        const double t0 = b1_0 + a2_0*s0;
+        const double t1 = b1_1 + a2_1*s1;
+        const double C0 = f + a1_0*t0 + a1_1*t1 + a2_0*b2_0 + a2_1*b2_1;
+        const double t2 = b2_0 + a1_0*s0;
+        const double t4 = t0 + t2;
+        const double hh0 = 0.5*t4*t4;
+        const double t5 = b1_0 + a2_0*s0 - t2;
+        const double hh1 = 0.5*t5*t5;
+        const double t3 = b2_1 + a1_1*s1;
+        const double t6 = t1 + t3;
+        const double hh2 = 0.5*t6*t6;
+        const double t7 = b1_1 + a2_1*s1 - t3;
+        const double hh3 = 0.5*t7*t7;
+        const double start = C0/(1e-300 + hh0 + hh1 + hh2 + hh3);
+        double l = ((-pole - start)*(pole - start) > 0.0 ? 0.0 : start);
+        double low = (C0 > 0.0 ? 0.0 : -pole);
+        double high = (C0 > 0.0 ? pole : 0.0);
+        double change = 0.0;
+        for (int pass = 0; pass < 100; ++pass) {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double inverse0 = 1.0/(above0*below0);
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double t9 = l*s1;
+            const double below1 = 1.0 - t9;
+            const double above1 = 1.0 + t9;
+            const double inverse1 = 1.0/(above1*below1);
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double t10 = 0.5*t8;
+            const double t11 = 0.5*t9;
+            const double value = C0 - hh0*l*r0*r0*(1.0 + t10) - hh1*l*r1*r1*(1.0 - t10) - hh2*l*r2*r2*(1.0 + t11) - hh3*l*r3*r3*(1.0 - t11);
+            const double high_new = (value > 0.0 ? high : l);
+            const double low_new = (value > 0.0 ? l : low);
+            const double step = value/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t12 = l + step;
+            const double moved = ((high_new - t12)*(low_new - t12) > 0.0 ? 0.5*high_new + 0.5*low_new : t12);
+            const double t13 = moved - l;
+            l = moved;
+            low = low_new;
+            high = high_new;
+            change = t13;
+        }
+        const double t14 = l*s0;
+        const double below0 = 1.0 - t14;
+        const double above0 = 1.0 + t14;
+        const double inverse0 = 1.0/(above0*below0);
+        const double r0 = below0*inverse0;
+        const double r1 = above0*inverse0;
+        const double t15 = l*s1;
+        const double below1 = 1.0 - t15;
+        const double above1 = 1.0 + t15;
+        const double inverse1 = 1.0/(above1*below1);
+        const double r2 = below1*inverse1;
+        const double r3 = above1*inverse1;
+        multiplier[i] = l;
+        last_change[i] = change;
+        d[i] = l*sqrt(hh0*r0*r0 + hh1*r1*r1 + hh2*r2*r2 + hh3*r3*r3);
+    }
+}
+
+/* Formula: corrected match, and d d / d vect(F) = vect(q2_hat q1_hat^T) / |n| of the signed
+   distance (envelope theorem); each match with its own frame.
+   Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,), l ()
+   Outputs: q1_hat (2,), q2_hat (2,), dd_dF (9,)
+   Operations: 101, temporaries: 40. */
+EG_EXPORT void eg_foot_point_derivative_each(
+    ptrdiff_t n,
+    const double *EG_RESTRICT R1,
+    const double *EG_RESTRICT R2,
+    const double *EG_RESTRICT s,
+    const double *EG_RESTRICT b1,
+    const double *EG_RESTRICT b2,
+    const double *EG_RESTRICT f_array,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT l_array,
+    double *EG_RESTRICT q1_hat,
+    double *EG_RESTRICT q2_hat,
+    double *EG_RESTRICT dd_dF)
+{
+    (void)f_array;
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double R1_00 = R1[i];
+        const double R1_01 = R1[n + i];
+        const double R1_10 = R1[2*n + i];
+        const double R1_11 = R1[3*n + i];
+        const double R2_00 = R2[i];
+        const double R2_01 = R2[n + i];
+        const double R2_10 = R2[2*n + i];
+        const double R2_11 = R2[3*n + i];
+        const double s0 = s[i];
+        const double s1 = s[n + i];
+        const double b1_0 = b1[i];
+        const double b1_1 = b1[n + i];
+        const double b2_0 = b2[i];
+        const double b2_1 = b2[n + i];
+        const double q1_0 = q1[i];
+        const double q1_1 = q1[n + i];
+        const double q2_0 = q2[i];
+        const double q2_1 = q2[n + i];
+        const double l = l_array[i];
+        const double a1_1 = R1_01*q1_0 + R1_11*q1_1;
+        const double a2_1 = R2_01*q2_0 + R2_11*q2_1;
+        const double t1 = l*s1;
+        const double below1 = 1.0 - t1;
+        const double above1 = 1.0 + t1;
+        const double inverse1 = 1.0/(above1*below1);
+        const double r2 = below1*inverse1;
+        const double t3 = 0.5*sqrt(2.0);
+        const double t9 = b2_1 + a1_1*s1;
+        const double t10 = r2*t3*(b1_1 + t9 + a2_1*s1);
+        const double r3 = above1*inverse1;
+        const double t11 = r3*t3*(b1_1 + a2_1*s1 - t9);
+        const double t12 = t10 + t11;
+        const double t7 = l*t3;
+        const double t13 = a1_1 - t12*t7;
+        const double a1_0 = R1_00*q1_0 + R1_10*q1_1;
+        const double a2_0 = R2_00*q2_0 + R2_10*q2_1;
+        const double t0 = l*s0;
+        const double below0 = 1.0 - t0;
+        const double above0 = 1.0 + t0;
+        const double inverse0 = 1.0/(above0*below0);
+        const double r0 = below0*inverse0;
+        const double t2 = b2_0 + a1_0*s0;
+        const double t4 = r0*t3*(b1_0 + t2 + a2_0*s0);
+        const double r1 = above0*inverse0;
+        const double t5 = r1*t3*(b1_0 + a2_0*s0 - t2);
+        const double t6 = t4 + t5;
+        const double t8 = a1_0 - t6*t7;
+        const double p1_0 = R1_00*t8 + R1_01*t13;
+        const double p1_1 = R1_10*t8 + R1_11*t13;
+        const double t14 = t4 - t5;
+        const double t15 = a2_0 - t14*t7;
+        const double t16 = t10 - t11;
+        const double t17 = a2_1 - t16*t7;
+        const double p2_0 = R2_00*t15 + R2_01*t17;
+        const double p2_1 = R2_10*t15 + R2_11*t17;
+        const double length = sqrt(1e-300 + 0.5*t12*t12 + 0.5*t14*t14 + 0.5*t16*t16 + 0.5*t6*t6);
+        const double t18 = 1.0/length;
+        const double t19 = p2_0*t18;
+        const double t20 = p2_1*t18;
+        q1_hat[i] = p1_0;
+        q1_hat[n + i] = p1_1;
+        q2_hat[i] = p2_0;
+        q2_hat[n + i] = p2_1;
+        dd_dF[i] = p1_0*t19;
+        dd_dF[n + i] = p1_1*t19;
+        dd_dF[2*n + i] = t19;
+        dd_dF[3*n + i] = p1_0*t20;
+        dd_dF[4*n + i] = p1_1*t20;
+        dd_dF[5*n + i] = t20;
+        dd_dF[6*n + i] = p1_0*t18;
+        dd_dF[7*n + i] = p1_1*t18;
+        dd_dF[8*n + i] = t18;
+    }
+}
+
 /* Formula: gradient and Gauss-Newton matrix (upper triangle) of sum weight d^2 / 2 by vect(F)
    of the rotated images.
    Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,

@@ -19,7 +19,7 @@ class Signature(NamedTuple):
     formula: str
 
 
-C_DIGEST = "cca21203867e8d06"
+C_DIGEST = "90d77f951338b7e8"
 
 SIGNATURES = {
     "block_derivatives": Signature(
@@ -387,6 +387,24 @@ SIGNATURES = {
         (Argument("R1", (2, 2), False), Argument("R2", (2, 2), False), Argument("s", (2,), False), Argument("b1", (2,), False), Argument("b2", (2,), False), Argument("f", (), False), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("l", (), True), ),
         (Argument("q1_hat", (2,), True), Argument("q2_hat", (2,), True), Argument("dd_dF", (9,), True), ),
         "corrected match, and d d / d vect(F) = vect(q2_hat q1_hat^T) / |n| of the signed distance (envelope theorem).",
+    ),
+    "foot_point_each": Signature(
+        "reprojection",
+        (Argument("R1", (2, 2), True), Argument("R2", (2, 2), True), Argument("s", (2,), True), Argument("b1", (2,), True), Argument("b2", (2,), True), Argument("f", (), True), Argument("q1", (2,), True), Argument("q2", (2,), True), ),
+        (Argument("multiplier", (), True), Argument("last_change", (), True), Argument("d", (), True), ),
+        "multiplier l of the foot point by 2 passes of bracketed Newton from the Sampson correction, its last change, and the signed distance d = l |n|; each match with its own frame.",
+    ),
+    "foot_point_safe_each": Signature(
+        "reprojection",
+        (Argument("R1", (2, 2), True), Argument("R2", (2, 2), True), Argument("s", (2,), True), Argument("b1", (2,), True), Argument("b2", (2,), True), Argument("f", (), True), Argument("q1", (2,), True), Argument("q2", (2,), True), ),
+        (Argument("multiplier", (), True), Argument("last_change", (), True), Argument("d", (), True), ),
+        "multiplier l of the foot point by 100 passes of bracketed Newton from the Sampson correction, its last change, and the signed distance d = l |n|; each match with its own frame.",
+    ),
+    "foot_point_derivative_each": Signature(
+        "reprojection",
+        (Argument("R1", (2, 2), True), Argument("R2", (2, 2), True), Argument("s", (2,), True), Argument("b1", (2,), True), Argument("b2", (2,), True), Argument("f", (), True), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("l", (), True), ),
+        (Argument("q1_hat", (2,), True), Argument("q2_hat", (2,), True), Argument("dd_dF", (9,), True), ),
+        "corrected match, and d d / d vect(F) = vect(q2_hat q1_hat^T) / |n| of the signed distance (envelope theorem); each match with its own frame.",
     ),
     "reprojection_gauss_newton": Signature(
         "reprojection",

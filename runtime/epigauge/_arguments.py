@@ -20,6 +20,7 @@ __all__ = [
     "as_calibration",
     "as_choice",
     "as_count",
+    "as_covariances",
     "as_fundamental",
     "as_matches",
     "as_positive",
@@ -318,6 +319,46 @@ def as_weights(weights: ArrayLike, m: int) -> Array:
     if m and not w.any():
         raise ArgumentError("weights", "is zero for every match", "some positive weights")
     return w
+
+
+def as_covariances(name: str, value: ArrayLike, m: int) -> Array:
+    """Check 2x2 covariances of image points: symmetric positive definite, for all or for each.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument for the message.
+    value : array_like, shape (2, 2) or (m, 2, 2)
+        One for all points, or one for each.
+    m : int
+        Number of points.
+
+    Returns
+    -------
+    ndarray, shape (m, 2, 2), float64
+        A matrix for each point: do not write into it.
+
+    Raises
+    ------
+    ArgumentError
+        On another shape or type, NaN or infinity, or a matrix that is not symmetric (to 1e-12 of
+        its largest entry) or not positive definite (the first such row is named).
+    """
+    needed = f"a (2, 2) or ({m}, 2, 2) array"
+    covariances = _real(name, value, needed)
+    if covariances.shape not in ((2, 2), (m, 2, 2)):
+        raise ArgumentError(name, f"has shape {covariances.shape}", needed)
+    covariances = np.broadcast_to(covariances, (m, 2, 2))
+    a, b, c, d = covariances.reshape(m, 4).T
+    with np.errstate(over="ignore", invalid="ignore"):
+        symmetric = np.abs(b - c) <= 1e-12 * np.maximum(np.abs(b), np.abs(c))
+        good = symmetric & (a > 0.0) & (d > 0.0) & (a * d - b * c > 1e-14 * a * d)
+    bad = np.flatnonzero(~(good & np.isfinite(covariances).all(axis=(1, 2))))
+    if len(bad):
+        raise ArgumentError(
+            name, f"has {covariances[bad[0]].tolist()} in row {bad[0]}", "positive definite ones"
+        )
+    return covariances
 
 
 def _points(name: str, value: ArrayLike) -> Array:

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from epigauge._arguments import as_choice, as_count, as_positive
 from epigauge.errors import ArgumentError
+from epigauge.multi_view.tracks import MIN_POINTS, MIN_VIEWS, Reconstruction, Tracks
 
-__all__ = ["TwoViewScene", "two_view_scene"]
+__all__ = ["MultiViewScene", "TwoViewScene", "multi_view_scene", "two_view_scene"]
 
 Array = NDArray[np.float64]
 
@@ -149,6 +150,132 @@ def two_view_scene(
         K=K,
         X=X,
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MultiViewScene:
+    """Views of random points, and the truth behind them.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Measured points, in pixels; the origin is the principal point.
+    true : Reconstruction
+        True cameras K (R | t), from metres to pixels, and points (x, y, z, 1) in metres; the
+        centre of the cube is the origin.
+    xy_true : ndarray, shape (N, 2)
+        The measured points without noise, in the order of the tracks.
+    """
+
+    tracks: Tracks
+    true: Reconstruction
+    xy_true: Array
+
+
+def multi_view_scene(
+    flatness: float = 0.5,
+    n_views: int = 5,
+    n_points: int = 100,
+    noise_px: float = 1.0,
+    distance: float = 10.0,
+    baseline: float = 3.0,
+    focal: float = 1000.0,
+    cube: float = 1.0,
+    visible: float = 1.0,
+    seed: int = 0,
+) -> MultiViewScene:
+    """Simulate the views of Bartoli's gauge experiments.
+
+    Points are offset from a base plane inside a cube and seen by equal cameras on an arc around
+    it, which look at its centre. The base plane faces the middle of the arc, and offsets are
+    uniform in [0, 2 `flatness`], which the paper does not say: the points fill a slab of that
+    thickness in the middle of the cube. The defaults are the paper's, with its strongest geometry.
+
+    Parameters
+    ----------
+    flatness : float
+        Mean offset d of the points from the base plane, in metres; at most half the cube.
+    n_views, n_points : int
+        Numbers of cameras and points.
+    noise_px : float
+        Standard deviation of the Gaussian noise on each image coordinate, in pixels.
+    distance : float
+        Distance of the cameras from the centre of the cube, in metres.
+    baseline : float
+        Distance between consecutive cameras, in metres.
+    focal : float
+        Focal length, in pixels.
+    cube : float
+        Side of the cube, in metres.
+    visible : float
+        Chance that a point is seen in a view; every point is seen twice at least, and every view
+        sees six points.
+    seed : int
+        Seed of NumPy's default generator. One seed gives the same points, but for their offset's
+        scale, whatever the other arguments.
+
+    Returns
+    -------
+    MultiViewScene
+        Measurements and truth.
+
+    Raises
+    ------
+    ArgumentError
+        If an argument is out of range, or a camera could have points beside or behind it.
+
+    References
+    ----------
+    .. [B03] A. Bartoli, "Towards gauge invariant bundle adjustment", ICCV 2003, section 7.1.
+    """
+    distance, baseline = as_positive("distance", distance), as_positive("baseline", baseline)
+    focal, cube = as_positive("focal", focal), as_positive("cube", cube)
+    flatness = as_positive("flatness", flatness, zero=True)
+    noise_px = as_positive("noise_px", noise_px, zero=True)
+    visible = as_positive("visible", visible)
+    n_views = as_count("n_views", n_views, at_least=MIN_VIEWS)
+    n_points = as_count("n_points", n_points, at_least=MIN_POINTS)
+    if 2.0 * flatness > cube:
+        raise ArgumentError("flatness", f"is {flatness:g} m", f"at most half the cube's {cube:g} m")
+    if distance <= cube * 3**0.5 / 2 or distance <= baseline / 2:
+        raise ArgumentError(
+            "distance",
+            f"is {distance:g} m, with a baseline of {baseline:g} m and a cube of {cube:g} m",
+            "cameras outside the cube",
+        )
+    if visible > 1.0:
+        raise ArgumentError("visible", f"is {visible:g}", "a share, at most 1")
+
+    random = np.random.default_rng(as_count("seed", seed, at_least=0))
+    place = random.uniform(-0.5, 0.5, (n_points, 3))
+    Q = np.column_stack([place * [cube, cube, 2.0 * flatness], np.ones(n_points)])
+    turn = 2.0 * np.arcsin(baseline / (2.0 * distance))
+    angles = turn * (np.arange(n_views) - (n_views - 1) / 2.0)
+    K = np.diag([focal, focal, 1.0])
+    P = np.stack(
+        [
+            K @ _looking_at_origin(centre) @ np.column_stack([np.eye(3), -centre])
+            for centre in distance * np.column_stack([np.sin(angles), 0 * angles, -np.cos(angles)])
+        ]
+    )
+    noise = noise_px * random.standard_normal((n_points, n_views, 2))
+    point, view = np.nonzero(_visibility(random, n_points, n_views, visible))
+    true = Reconstruction(P, Q)
+    h = np.einsum("nij,nj->ni", P[view], Q[point])
+    xy_true = h[:, :2] / h[:, 2:]
+    tracks = Tracks(view, point, xy_true + noise[point, view])
+    return MultiViewScene(tracks, true, xy_true)
+
+
+def _visibility(
+    random: np.random.Generator, n_points: int, n_views: int, share: float
+) -> NDArray[np.bool_]:
+    """Draw who sees whom: the least likely pairs are dropped, but for the few each one needs."""
+    chance = random.uniform(size=(n_points, n_views))
+    rank_of_view = chance.argsort(axis=1).argsort(axis=1)
+    rank_of_point = chance.argsort(axis=0).argsort(axis=0)
+    needed = (rank_of_view < MIN_VIEWS) | (rank_of_point < MIN_POINTS)
+    return np.asarray((chance < share) | needed)
 
 
 def _looking_at_origin(centre: Array) -> Array:

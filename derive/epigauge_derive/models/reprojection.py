@@ -14,6 +14,8 @@ global correction. Newton from l = 0 starts with the Sampson correction.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import sympy as sp
 
 from epigauge_derive.kernel import Input, Kernel, Let, Loop, Output, jacobian, select, upper
@@ -151,7 +153,15 @@ def stationary_point() -> tuple[list[sp.Expr], list[sp.Expr], list[sp.Expr]]:
 
 def kernels() -> list[Kernel]:
     """Return the frame of an F, the foot point, and what the solver sums up at it."""
-    return [_frame(), *_foot_points(), _points(), *_normal_equations()]
+    feet = [*_foot_points(), _points()]
+    return [_frame(), *feet, *map(_with_own_frames, feet), *_normal_equations()]
+
+
+def _with_own_frames(kernel: Kernel) -> Kernel:
+    """Return a kernel for matches that each have an F of their own, as whitening gives them."""
+    inputs = tuple(replace(argument, shared=False) for argument in kernel.inputs)
+    formula = f"{kernel.formula[:-1]}; each match with its own frame."
+    return replace(kernel, name=f"{kernel.name}_each", formula=formula, inputs=inputs)
 
 
 def _frame() -> Kernel:

@@ -313,6 +313,267 @@ def foot_point_derivative(R1, R2, s, b1, b2, f, q1, q2, l, q1_hat, q2_hat, dd_dF
     dd_dF[8] = t18
 
 
+def foot_point_each(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
+    # Formula: multiplier l of the foot point by 2 passes of bracketed Newton from the Sampson
+    # correction, its last change, and the signed distance d = l |n|; each match with its own
+    # frame.
+    # Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,)
+    # Outputs: multiplier (), last_change (), d ()
+    # Operations: 216, temporaries: 56.
+    R1_00 = R1[0, 0]
+    R1_01 = R1[0, 1]
+    R1_10 = R1[1, 0]
+    R1_11 = R1[1, 1]
+    R2_00 = R2[0, 0]
+    R2_01 = R2[0, 1]
+    R2_10 = R2[1, 0]
+    R2_11 = R2[1, 1]
+    s0 = s[0]
+    s1 = s[1]
+    b1_0 = b1[0]
+    b1_1 = b1[1]
+    b2_0 = b2[0]
+    b2_1 = b2[1]
+    q1_0 = q1[0]
+    q1_1 = q1[1]
+    q2_0 = q2[0]
+    q2_1 = q2[1]
+    pole = 0.9999999999999858/(1e-140 + s0)
+    a1_0 = R1_00*q1_0 + R1_10*q1_1
+    a1_1 = R1_01*q1_0 + R1_11*q1_1
+    a2_0 = R2_00*q2_0 + R2_10*q2_1
+    a2_1 = R2_01*q2_0 + R2_11*q2_1
+    t0 = b1_0 + a2_0*s0
+    t1 = b1_1 + a2_1*s1
+    C0 = f + a1_0*t0 + a1_1*t1 + a2_0*b2_0 + a2_1*b2_1
+    t2 = b2_0 + a1_0*s0
+    t4 = t0 + t2
+    hh0 = 0.5*t4*t4
+    t5 = b1_0 + a2_0*s0 - t2
+    hh1 = 0.5*t5*t5
+    t3 = b2_1 + a1_1*s1
+    t6 = t1 + t3
+    hh2 = 0.5*t6*t6
+    t7 = b1_1 + a2_1*s1 - t3
+    hh3 = 0.5*t7*t7
+    start = C0/(1e-300 + hh0 + hh1 + hh2 + hh3)
+    l = np.where((-pole - start)*(pole - start) > 0.0, 0.0, start)
+    low = np.where(C0 > 0.0, 0.0, -pole)
+    high = np.where(C0 > 0.0, pole, 0.0)
+    change = 0.0
+    for _ in range(2):
+        t8 = l*s0
+        below0 = 1.0 - t8
+        above0 = 1.0 + t8
+        inverse0 = 1.0/(above0*below0)
+        r0 = below0*inverse0
+        r1 = above0*inverse0
+        t9 = l*s1
+        below1 = 1.0 - t9
+        above1 = 1.0 + t9
+        inverse1 = 1.0/(above1*below1)
+        r2 = below1*inverse1
+        r3 = above1*inverse1
+        t10 = 0.5*t8
+        t11 = 0.5*t9
+        value = C0 - hh0*l*r0*r0*(1.0 + t10) - hh1*l*r1*r1*(1.0 - t10) - hh2*l*r2*r2*(1.0 + t11) - hh3*l*r3*r3*(1.0 - t11)
+        high_new = np.where(value > 0.0, high, l)
+        low_new = np.where(value > 0.0, l, low)
+        step = value/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3)
+        t12 = l + step
+        moved = np.where((high_new - t12)*(low_new - t12) > 0.0, 0.5*high_new + 0.5*low_new, t12)
+        t13 = moved - l
+        l = moved
+        low = low_new
+        high = high_new
+        change = t13
+    t14 = l*s0
+    below0 = 1.0 - t14
+    above0 = 1.0 + t14
+    inverse0 = 1.0/(above0*below0)
+    r0 = below0*inverse0
+    r1 = above0*inverse0
+    t15 = l*s1
+    below1 = 1.0 - t15
+    above1 = 1.0 + t15
+    inverse1 = 1.0/(above1*below1)
+    r2 = below1*inverse1
+    r3 = above1*inverse1
+    multiplier[...] = l
+    last_change[...] = change
+    d[...] = l*np.sqrt(hh0*r0*r0 + hh1*r1*r1 + hh2*r2*r2 + hh3*r3*r3)
+
+
+def foot_point_safe_each(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
+    # Formula: multiplier l of the foot point by 100 passes of bracketed Newton from the Sampson
+    # correction, its last change, and the signed distance d = l |n|; each match with its own
+    # frame.
+    # Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,)
+    # Outputs: multiplier (), last_change (), d ()
+    # Operations: 6488, temporaries: 56.
+    R1_00 = R1[0, 0]
+    R1_01 = R1[0, 1]
+    R1_10 = R1[1, 0]
+    R1_11 = R1[1, 1]
+    R2_00 = R2[0, 0]
+    R2_01 = R2[0, 1]
+    R2_10 = R2[1, 0]
+    R2_11 = R2[1, 1]
+    s0 = s[0]
+    s1 = s[1]
+    b1_0 = b1[0]
+    b1_1 = b1[1]
+    b2_0 = b2[0]
+    b2_1 = b2[1]
+    q1_0 = q1[0]
+    q1_1 = q1[1]
+    q2_0 = q2[0]
+    q2_1 = q2[1]
+    pole = 0.9999999999999858/(1e-140 + s0)
+    a1_0 = R1_00*q1_0 + R1_10*q1_1
+    a1_1 = R1_01*q1_0 + R1_11*q1_1
+    a2_0 = R2_00*q2_0 + R2_10*q2_1
+    a2_1 = R2_01*q2_0 + R2_11*q2_1
+    t0 = b1_0 + a2_0*s0
+    t1 = b1_1 + a2_1*s1
+    C0 = f + a1_0*t0 + a1_1*t1 + a2_0*b2_0 + a2_1*b2_1
+    t2 = b2_0 + a1_0*s0
+    t4 = t0 + t2
+    hh0 = 0.5*t4*t4
+    t5 = b1_0 + a2_0*s0 - t2
+    hh1 = 0.5*t5*t5
+    t3 = b2_1 + a1_1*s1
+    t6 = t1 + t3
+    hh2 = 0.5*t6*t6
+    t7 = b1_1 + a2_1*s1 - t3
+    hh3 = 0.5*t7*t7
+    start = C0/(1e-300 + hh0 + hh1 + hh2 + hh3)
+    l = np.where((-pole - start)*(pole - start) > 0.0, 0.0, start)
+    low = np.where(C0 > 0.0, 0.0, -pole)
+    high = np.where(C0 > 0.0, pole, 0.0)
+    change = 0.0
+    for _ in range(100):
+        t8 = l*s0
+        below0 = 1.0 - t8
+        above0 = 1.0 + t8
+        inverse0 = 1.0/(above0*below0)
+        r0 = below0*inverse0
+        r1 = above0*inverse0
+        t9 = l*s1
+        below1 = 1.0 - t9
+        above1 = 1.0 + t9
+        inverse1 = 1.0/(above1*below1)
+        r2 = below1*inverse1
+        r3 = above1*inverse1
+        t10 = 0.5*t8
+        t11 = 0.5*t9
+        value = C0 - hh0*l*r0*r0*(1.0 + t10) - hh1*l*r1*r1*(1.0 - t10) - hh2*l*r2*r2*(1.0 + t11) - hh3*l*r3*r3*(1.0 - t11)
+        high_new = np.where(value > 0.0, high, l)
+        low_new = np.where(value > 0.0, l, low)
+        step = value/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3)
+        t12 = l + step
+        moved = np.where((high_new - t12)*(low_new - t12) > 0.0, 0.5*high_new + 0.5*low_new, t12)
+        t13 = moved - l
+        l = moved
+        low = low_new
+        high = high_new
+        change = t13
+    t14 = l*s0
+    below0 = 1.0 - t14
+    above0 = 1.0 + t14
+    inverse0 = 1.0/(above0*below0)
+    r0 = below0*inverse0
+    r1 = above0*inverse0
+    t15 = l*s1
+    below1 = 1.0 - t15
+    above1 = 1.0 + t15
+    inverse1 = 1.0/(above1*below1)
+    r2 = below1*inverse1
+    r3 = above1*inverse1
+    multiplier[...] = l
+    last_change[...] = change
+    d[...] = l*np.sqrt(hh0*r0*r0 + hh1*r1*r1 + hh2*r2*r2 + hh3*r3*r3)
+
+
+def foot_point_derivative_each(R1, R2, s, b1, b2, f, q1, q2, l, q1_hat, q2_hat, dd_dF):
+    # Formula: corrected match, and d d / d vect(F) = vect(q2_hat q1_hat^T) / |n| of the signed
+    # distance (envelope theorem); each match with its own frame.
+    # Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,), l ()
+    # Outputs: q1_hat (2,), q2_hat (2,), dd_dF (9,)
+    # Operations: 101, temporaries: 40.
+    R1_00 = R1[0, 0]
+    R1_01 = R1[0, 1]
+    R1_10 = R1[1, 0]
+    R1_11 = R1[1, 1]
+    R2_00 = R2[0, 0]
+    R2_01 = R2[0, 1]
+    R2_10 = R2[1, 0]
+    R2_11 = R2[1, 1]
+    s0 = s[0]
+    s1 = s[1]
+    b1_0 = b1[0]
+    b1_1 = b1[1]
+    b2_0 = b2[0]
+    b2_1 = b2[1]
+    q1_0 = q1[0]
+    q1_1 = q1[1]
+    q2_0 = q2[0]
+    q2_1 = q2[1]
+    a1_1 = R1_01*q1_0 + R1_11*q1_1
+    a2_1 = R2_01*q2_0 + R2_11*q2_1
+    t1 = l*s1
+    below1 = 1.0 - t1
+    above1 = 1.0 + t1
+    inverse1 = 1.0/(above1*below1)
+    r2 = below1*inverse1
+    t3 = 0.5*np.sqrt(2.0)
+    t9 = b2_1 + a1_1*s1
+    t10 = r2*t3*(b1_1 + t9 + a2_1*s1)
+    r3 = above1*inverse1
+    t11 = r3*t3*(b1_1 + a2_1*s1 - t9)
+    t12 = t10 + t11
+    t7 = l*t3
+    t13 = a1_1 - t12*t7
+    a1_0 = R1_00*q1_0 + R1_10*q1_1
+    a2_0 = R2_00*q2_0 + R2_10*q2_1
+    t0 = l*s0
+    below0 = 1.0 - t0
+    above0 = 1.0 + t0
+    inverse0 = 1.0/(above0*below0)
+    r0 = below0*inverse0
+    t2 = b2_0 + a1_0*s0
+    t4 = r0*t3*(b1_0 + t2 + a2_0*s0)
+    r1 = above0*inverse0
+    t5 = r1*t3*(b1_0 + a2_0*s0 - t2)
+    t6 = t4 + t5
+    t8 = a1_0 - t6*t7
+    p1_0 = R1_00*t8 + R1_01*t13
+    p1_1 = R1_10*t8 + R1_11*t13
+    t14 = t4 - t5
+    t15 = a2_0 - t14*t7
+    t16 = t10 - t11
+    t17 = a2_1 - t16*t7
+    p2_0 = R2_00*t15 + R2_01*t17
+    p2_1 = R2_10*t15 + R2_11*t17
+    length = np.sqrt(1e-300 + 0.5*t12*t12 + 0.5*t14*t14 + 0.5*t16*t16 + 0.5*t6*t6)
+    t18 = 1.0/length
+    t19 = p2_0*t18
+    t20 = p2_1*t18
+    q1_hat[0] = p1_0
+    q1_hat[1] = p1_1
+    q2_hat[0] = p2_0
+    q2_hat[1] = p2_1
+    dd_dF[0] = p1_0*t19
+    dd_dF[1] = p1_1*t19
+    dd_dF[2] = t19
+    dd_dF[3] = p1_0*t20
+    dd_dF[4] = p1_1*t20
+    dd_dF[5] = t20
+    dd_dF[6] = p1_0*t18
+    dd_dF[7] = p1_1*t18
+    dd_dF[8] = t18
+
+
 def reprojection_gauss_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, g, N):
     # Formula: gradient and Gauss-Newton matrix (upper triangle) of sum weight d^2 / 2 by vect(F)
     # of the rotated images.

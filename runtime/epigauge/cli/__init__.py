@@ -15,6 +15,7 @@ from epigauge.cli._common import command
 from epigauge.cli.demo import demo
 from epigauge.cli.info import info
 from epigauge.cli.refine import refine
+from epigauge.cli.reproduce import reproduce
 
 __all__ = ["app"]
 
@@ -45,5 +46,5 @@ def _main(
     """
 
 
-for _function in (demo, refine, info):
+for _function in (demo, refine, info, reproduce):
     app.command()(command(_function))

@@ -27,6 +27,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "eliminated, Gauss-Newton": {"hessian": "gauss-newton"},
     "eliminated, Newton": {},
 }
+_POINTS = 50
 _START, _DEFAULT = "8-point, the start", "eliminated, Newton"
 
 
@@ -60,17 +61,16 @@ def demo(
     as_count("--trials", trials)
     out = console()
     found = {name: Trials() for name in (_START, *METHODS)}
-    seeds = track(
-        range(trials), "solving", console=out, transient=True, disable=json or not out.is_terminal
-    )
-    for seed in seeds:
-        scene = two_view_scene(distance, seed=seed)
+    seeds = range(trials)
+    watched = out.is_terminal and not json
+    for seed in track(seeds, "solving", console=out, transient=True) if watched else seeds:
+        scene = two_view_scene(distance, n_points=_POINTS, seed=seed)
         F0 = _timed(found[_START], scene, eg.fundamental_8point)
         for name, options in METHODS.items():
             _timed(found[name], scene, eg.refine_fundamental, F0, **options)
     if not json:
         out.print(_table(found, distance, trials))
-    picture = None if no_plot else _picture(output, two_view_scene(distance, seed=0), out)
+    picture = None if no_plot else _picture(output, two_view_scene(distance, n_points=_POINTS), out)
     if json:
         rows = {name: vars(measured) for name, measured in found.items()}
         write_json({"distance": distance, "methods": rows, "picture": picture and str(picture)})
@@ -99,7 +99,7 @@ def _table(found: dict[str, Trials], distance: float, trials: int) -> Table:
     """Put the means side by side."""
     scenes = "1 scene" if trials == 1 else f"mean of {trials} scenes"
     table = Table(
-        title=f"50 points at {distance:g} m, noise of 2 px variance, {scenes}",
+        title=f"{_POINTS} points at {distance:g} m, noise of 2 px variance, {scenes}",
         title_justify="left",
         caption="evals: evaluations of the cost; RMS: of the residual coordinates;\n"
         "error: RMS distance of the true points to the estimated epipolar geometry;\n"
@@ -116,7 +116,7 @@ def _table(found: dict[str, Trials], distance: float, trials: int) -> Table:
             name,
             f"{evaluations:.1f}" if evaluations else "-",
             f"{cost.mean():.4f}",
-            f"{np.sqrt(2 * cost / (4 * 50)).mean():.5f}",
+            f"{np.sqrt(2 * cost / (4 * _POINTS)).mean():.5f}",
             f"{np.mean(measured.error_px):.4f}",
             f"{np.median(measured.milliseconds):.2f}",
             style="bold" if name == _DEFAULT else None,

@@ -32,11 +32,11 @@ def info(json: Json = False) -> int:
         "epigauge": eg.__version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "processor": _processor(),
+        "processor": processor(),
         "cores": os.cpu_count(),
         "backend": eg.backend(),
         "backends": eg.kernels.available(),
-        "packages": {module: _version(module) for module in _PACKAGES},
+        "packages": {module: version(module) for module in _PACKAGES},
     }
     if json:
         write_json(known)
@@ -52,7 +52,7 @@ def info(json: Json = False) -> int:
     return DONE
 
 
-def _version(module: str) -> str | None:
+def version(module: str) -> str | None:
     """Return the version of an installed package without importing it."""
     for distribution in _PACKAGES[module]:
         try:
@@ -62,7 +62,7 @@ def _version(module: str) -> str | None:
     return "unknown" if find_spec(module) is not None else None
 
 
-def _processor() -> str:
+def processor() -> str:
     """Return the name of the processor."""
     try:
         for line in Path("/proc/cpuinfo").read_text(errors="replace").splitlines():

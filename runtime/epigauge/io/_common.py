@@ -10,7 +10,8 @@ from epigauge.errors import ArgumentError
 
 PathLike = str | os.PathLike[str]
 
-#: Most matches read from one file. Larger files are refused before their content is allocated.
+#: Most matches or observations read from one file. Larger files are refused before their content
+#: is allocated.
 MAX_MATCHES = 10_000_000
 
 

@@ -1,11 +1,11 @@
-"""Matches in NPZ files, read without unpickling and with sizes checked before allocating."""
+"""NPZ files, read without unpickling and with sizes checked before allocating."""
 
 from __future__ import annotations
 
 import math
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -24,8 +24,10 @@ _ORDER = re.compile(r"'fortran_order': *(True|False)")
 _SHAPE = re.compile(r"'shape': *\(([0-9, ]{0,100})\)")
 
 
-def read_npz(path: Path, file: IO[bytes], inliers: bool) -> dict[str, Any]:
-    """Read the arrays of an NPZ file.
+def read_npz(
+    path: Path, file: IO[bytes], needed: Sequence[Sequence[str]], optional: Sequence[str] = ()
+) -> dict[str, NDArray[Any]]:
+    """Read some arrays of an NPZ file; the others are not looked at.
 
     Parameters
     ----------
@@ -33,13 +35,15 @@ def read_npz(path: Path, file: IO[bytes], inliers: bool) -> dict[str, Any]:
         Name of the file for messages.
     file : binary file
         Its content, seekable.
-    inliers : bool
-        Read the array ``inlier`` too.
+    needed : sequence of sequence of str
+        Alternatives: the first group of arrays that the file holds is read.
+    optional : sequence of str
+        Arrays read where the file holds them.
 
     Returns
     -------
     dict
-        Arrays x1, x2 and, where the file has them, weights, inlier, image_size1, image_size2.
+        The arrays by name.
 
     Raises
     ------
@@ -48,40 +52,28 @@ def read_npz(path: Path, file: IO[bytes], inliers: bool) -> dict[str, Any]:
     """
     if not file.read(1):
         raise FileFormatError(path, "is empty")
-    found: dict[str, Any] = {}
-    with _damage(path, "is not a readable NPZ (ZIP) file"), zipfile.ZipFile(file) as archive:
+    with damage(path, "is not a readable NPZ (ZIP) file"), zipfile.ZipFile(file) as archive:
         members = {name.removesuffix(".npy"): name for name in archive.namelist()}
-        wanted = ["weights", "image_size1", "image_size2"]
-        if inliers:
-            wanted.append("inlier")
-        if "x1" in members and "x2" in members:
-            wanted += ["x1", "x2"]
-        elif "matches" in members:
-            wanted.append("matches")
+        for group in needed:
+            if all(name in members for name in group):
+                break
         else:
+            alternatives = ", or ".join(" and ".join(group) for group in needed)
             raise FileFormatError(
-                path,
-                f"needs arrays x1 and x2, or matches; it holds {listed(list(members))}",
+                path, f"needs arrays {alternatives}; it holds {listed(list(members))}"
             )
-        for name in wanted:
-            if name in members:
-                found[name] = _read_npy(path, archive, members[name])
-    if "matches" in found:
-        table = found.pop("matches")
-        if table.ndim != 2 or table.shape[1] != 4:
-            raise FileFormatError(path, f"matches has shape {table.shape}, needed: (m, 4)")
-        found["x1"], found["x2"] = table[:, 0:2], table[:, 2:4]
-    return found
+        wanted = [*(name for name in optional if name in members), *group]
+        return {name: _read_npy(path, archive, members[name]) for name in wanted}
 
 
 def _read_npy(path: Path, archive: zipfile.ZipFile, member: str) -> NDArray[Any]:
     """Read one array, having checked its declared type and size before allocating it."""
     name = member.removesuffix(".npy")
-    with _damage(path, f"array {name} is damaged"), archive.open(member) as stream:
+    with damage(path, f"array {name} is damaged"), archive.open(member) as stream:
         shape, by_columns, dtype = _read_header(path, name, stream)
         if not all(0 <= side <= MAX_MATCHES for side in shape) or math.prod(shape) > _MAX_VALUES:
             raise FileFormatError(
-                path, f"array {name} has shape {cut(shape)}, needed: at most {MAX_MATCHES} matches"
+                path, f"array {name} has shape {cut(shape)}, needed: at most {MAX_MATCHES} rows"
             )
         size = math.prod(shape) * dtype.itemsize
         declared = archive.getinfo(member).file_size
@@ -123,7 +115,7 @@ def _read_header(path: Path, name: str, stream: IO[bytes]) -> tuple[tuple[int, .
 
 
 @contextmanager
-def _damage(path: Path, what: str) -> Iterator[None]:
+def damage(path: Path, what: str) -> Iterator[None]:
     """Turn what the readers raise on a damaged file into one kind of error.
 
     That is whatever ZIP, its decompressors and NumPy happen to raise: errors of a dozen types.

@@ -1,10 +1,11 @@
-"""Matches in text files: comma, semicolon or white space between the columns."""
+"""Tables in text files: comma, semicolon or white space between the columns."""
 
 from __future__ import annotations
 
 import array
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -13,14 +14,43 @@ import numpy as np
 from epigauge.errors import FileFormatError
 from epigauge.io._common import MAX_MATCHES, cut, listed
 
-COORDINATES = ("x1", "y1", "x2", "y2")
-
 _MAX_LINE = 4096
-_KNOWN = (*COORDINATES, "weight", "inlier")
 _FLAGS = {"0": False, "false": False, "1": True, "true": True}
 
 
-def read_text(path: Path, file: IO[bytes], inliers: bool) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Columns:
+    """The columns that a table can have.
+
+    Parameters
+    ----------
+    what : str
+        What one line holds, in the plural.
+    names : tuple of str
+        Columns needed; this is their order where the table does not name them.
+    indices : tuple of str
+        Those among them that hold whole numbers from 0.
+    numbers : tuple of str
+        Optional columns of numbers.
+    flags : tuple of str
+        Optional columns of marks, 0 or 1.
+    """
+
+    what: str
+    names: tuple[str, ...]
+    indices: tuple[str, ...] = ()
+    numbers: tuple[str, ...] = ("weight",)
+    flags: tuple[str, ...] = ()
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        """Return the names of all."""
+        return (*self.names, *self.numbers, *self.flags)
+
+
+def read_text(
+    path: Path, file: IO[bytes], columns: Columns, flag: str | None = None
+) -> dict[str, Any]:
     """Read the columns of a text file.
 
     Parameters
@@ -29,13 +59,15 @@ def read_text(path: Path, file: IO[bytes], inliers: bool) -> dict[str, Any]:
         Name of the file for messages.
     file : binary file
         Its content.
-    inliers : bool
-        Read the column ``inlier`` too.
+    columns : Columns
+        What it can hold.
+    flag : str, optional
+        The one column of marks to read.
 
     Returns
     -------
     dict
-        Arrays x1, x2 (m, 2) and, where the file has them, weights (m,) and inlier (m,).
+        For each column that the file has an array (m,).
 
     Raises
     ------
@@ -43,15 +75,15 @@ def read_text(path: Path, file: IO[bytes], inliers: bool) -> dict[str, Any]:
         Naming the line at fault.
     """
     names: Sequence[str] = ()
-    wanted: list[int] = []
+    wanted: dict[str, int] = {}
     separator: str | None = None
     flag_at: int | None = None
     values, flags = array.array("d"), bytearray()
-    for line, text, comment in _lines(path, file):
+    for line, text, comment in text_lines(path, file):
         if not text:
             fields = _split(comment, _separator(comment))
-            if not names and set(COORDINATES) <= set(fields) <= set(_KNOWN):
-                names = _names(path, fields, line)
+            if not names and set(columns.names) <= set(fields) <= set(columns.known):
+                names = _names(path, fields, columns, line)
             continue
         first = not wanted
         if first:
@@ -59,32 +91,35 @@ def read_text(path: Path, file: IO[bytes], inliers: bool) -> dict[str, Any]:
         fields = _split(text, separator)
         header = first and not any(map(_is_number, fields))
         if header:
-            names = _names(path, fields, line)
-        names = names or COORDINATES
+            names = _names(path, fields, columns, line)
+        names = names or columns.names
         if len(fields) != len(names):
-            raise FileFormatError(path, _column_count(len(fields), names), line)
+            raise FileFormatError(path, _column_count(len(fields), names, columns), line)
         if first:
-            wanted = [names.index(name) for name in (*COORDINATES, "weight") if name in names]
-            flag_at = names.index("inlier") if inliers and "inlier" in names else None
+            read = (*columns.names, *columns.numbers)
+            wanted = {name: names.index(name) for name in read if name in names}
+            flag_at = names.index(flag) if flag in names else None
         if header:
             continue
         if len(values) >= MAX_MATCHES * len(wanted):
-            raise FileFormatError(path, f"holds more than {MAX_MATCHES} matches", line)
-        values.extend(_row(path, [fields[column] for column in wanted], line))
+            raise FileFormatError(path, f"holds more than {MAX_MATCHES} {columns.what}", line)
+        row = numbers(path, [fields[column] for column in wanted.values()], line)
+        for name, value in zip(columns.indices, row, strict=False):
+            _check_index(path, name, value, line)
+        values.extend(row)
         if flag_at is not None:
-            flags.append(_flag(path, fields[flag_at], line))
+            flags.append(_flag(path, names[flag_at], fields[flag_at], line))
     if not values:
-        raise FileFormatError(path, "holds no matches" if file.tell() else "is empty")
+        raise FileFormatError(path, f"holds no {columns.what}" if file.tell() else "is empty")
     table = np.array(values).reshape(-1, len(wanted))
-    found: dict[str, Any] = {"x1": table[:, 0:2], "x2": table[:, 2:4]}
-    if "weight" in names:
-        found["weights"] = table[:, 4]
-    if flag_at is not None:
-        found["inlier"] = np.frombuffer(flags, dtype=np.bool_)
+    found: dict[str, Any] = dict(zip(wanted, table.T, strict=True))
+    found |= {name: found[name].astype(np.intp) for name in columns.indices}
+    if flag is not None and flag_at is not None:
+        found[flag] = np.frombuffer(flags, dtype=np.bool_)
     return found
 
 
-def _lines(path: Path, file: IO[bytes]) -> Iterator[tuple[int, str, str]]:
+def text_lines(path: Path, file: IO[bytes]) -> Iterator[tuple[int, str, str]]:
     """Yield (number, text, comment) of each line, without reading more than one at a time."""
     line = 0
     while raw := file.readline(_MAX_LINE + 1):
@@ -118,28 +153,30 @@ def _split(text: str, separator: str | None) -> list[str]:
     return [field.strip("\"'") for field in fields] if '"' in text or "'" in text else fields
 
 
-def _names(path: Path, fields: Sequence[str], line: int) -> list[str]:
+def _names(path: Path, fields: Sequence[str], columns: Columns, line: int) -> list[str]:
     """Check the names of the columns."""
     names = [field.lower() for field in fields]
-    missing = [name for name in COORDINATES if name not in names]
+    missing = [name for name in columns.names if name not in names]
     if missing:
         raise FileFormatError(
             path,
-            f"no column {', '.join(missing)} among {listed(fields)}; needed: x1, y1, x2, y2",
+            f"no column {', '.join(missing)} among {listed(fields)}; "
+            f"needed: {', '.join(columns.names)}",
             line,
         )
-    twice = [name for name in _KNOWN if names.count(name) > 1]
+    twice = [name for name in columns.known if names.count(name) > 1]
     if twice:
         raise FileFormatError(path, f"two columns are called {twice[0]}", line)
     return names
 
 
-def _column_count(found: int, names: Sequence[str]) -> str:
+def _column_count(found: int, names: Sequence[str], columns: Columns) -> str:
     """Say that a line has the wrong number of columns."""
-    columns = f"{found} column" + ("" if found == 1 else "s")
-    if names is COORDINATES:
-        return f"{columns}, needed: 4 (x1 y1 x2 y2), or a first line with the names of the columns"
-    return f"{columns}, needed: {len(names)} ({listed(names)})"
+    count = f"{found} column" + ("" if found == 1 else "s")
+    if names is columns.names:
+        order = f"{len(names)} ({' '.join(names)})"
+        return f"{count}, needed: {order}, or a first line with the names of the columns"
+    return f"{count}, needed: {len(names)} ({listed(names)})"
 
 
 def _is_number(field: str) -> bool:
@@ -150,8 +187,8 @@ def _is_number(field: str) -> bool:
     return True
 
 
-def _row(path: Path, fields: Sequence[str], line: int) -> list[float]:
-    """Read the numbers of one line."""
+def numbers(path: Path, fields: Sequence[str], line: int) -> list[float]:
+    """Read the finite numbers of one line."""
     try:
         row = list(map(float, fields))
     except ValueError:
@@ -176,9 +213,17 @@ def _coordinate(path: Path, field: str, line: int) -> float:
     return value
 
 
-def _flag(path: Path, field: str, line: int) -> bool:
-    """Read an inlier mark."""
+def _check_index(path: Path, name: str, value: float, line: int) -> None:
+    """Check that a number can be an index."""
+    if not (value.is_integer() and 0 <= value < MAX_MATCHES):
+        raise FileFormatError(
+            path, f"{name} is {value:g}, needed: a whole number from 0 below {MAX_MATCHES}", line
+        )
+
+
+def _flag(path: Path, name: str, field: str, line: int) -> bool:
+    """Read a mark."""
     try:
         return _FLAGS[field.lower()]
     except KeyError:
-        raise FileFormatError(path, f"inlier is {cut(field)!r}, needed: 0 or 1", line) from None
+        raise FileFormatError(path, f"{name} is {cut(field)!r}, needed: 0 or 1", line) from None

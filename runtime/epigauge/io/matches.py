@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,12 @@ from epigauge._arguments import as_matches, as_weights
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._common import PathLike, check_suffix, cut
 from epigauge.io._npz import read_npz
-from epigauge.io._text import COORDINATES, read_text
+from epigauge.io._text import Columns, read_text
 from epigauge.io.output import writing
 
 Array = NDArray[np.float64]
+
+_COLUMNS = Columns("matches", ("x1", "y1", "x2", "y2"), flags=("inlier",))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,9 +83,9 @@ def load_matches(path: PathLike, inliers: bool = False) -> Matches:
     path = Path(path)
     with path.open("rb") as file:
         if path.suffix.lower() == ".npz":
-            fields = read_npz(path, file, inliers)
+            fields = _from_npz(path, file, inliers)
         else:
-            fields = read_text(path, file, inliers)
+            fields = _from_text(path, file, inliers)
     return _matches(path, fields, inliers)
 
 
@@ -107,7 +109,7 @@ def save_matches(path: PathLike, matches: Matches) -> None:
     suffix = check_suffix(path, ".csv", ".txt", ".npz")
     x1, x2 = as_matches(matches.x1, matches.x2, at_least=1)
     columns = [*x1.T, *x2.T]
-    names = list(COORDINATES)
+    names = list(_COLUMNS.names)
     if matches.weights is not None:
         columns.append(as_weights(matches.weights, len(x1)))
         names.append("weight")
@@ -126,6 +128,31 @@ def save_matches(path: PathLike, matches: Matches) -> None:
         file.write(f"{head}\n".encode())
         for row in np.column_stack(columns).tolist():
             file.write((comma.join(map(repr, row)) + "\n").encode())
+
+
+def _from_npz(path: Path, file: IO[bytes], inliers: bool) -> dict[str, Any]:
+    """Read the arrays of an NPZ file."""
+    optional = ["weights", "image_size1", "image_size2", *(["inlier"] if inliers else [])]
+    found: dict[str, Any] = read_npz(path, file, [("x1", "x2"), ("matches",)], optional)
+    if "matches" in found:
+        table = found.pop("matches")
+        if table.ndim != 2 or table.shape[1] != 4:
+            raise FileFormatError(path, f"matches has shape {table.shape}, needed: (m, 4)")
+        found["x1"], found["x2"] = table[:, 0:2], table[:, 2:4]
+    return found
+
+
+def _from_text(path: Path, file: IO[bytes], inliers: bool) -> dict[str, Any]:
+    """Read the columns of a text file and put the coordinates together."""
+    columns = read_text(path, file, _COLUMNS, "inlier" if inliers else None)
+    found: dict[str, Any] = {
+        f"x{view}": np.column_stack([columns[f"x{view}"], columns[f"y{view}"]]) for view in (1, 2)
+    }
+    if "weight" in columns:
+        found["weights"] = columns["weight"]
+    if "inlier" in columns:
+        found["inlier"] = columns["inlier"]
+    return found
 
 
 def _matches(path: Path, fields: dict[str, Any], inliers: bool) -> Matches:

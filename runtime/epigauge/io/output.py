@@ -134,4 +134,4 @@ def _arrays(result: Any) -> dict[str, Any]:
 
 
 def _fields(value: Any) -> tuple[dataclasses.Field[Any], ...]:
-    return dataclasses.fields(value)
+    return tuple(field for field in dataclasses.fields(value) if not field.name.startswith("_"))

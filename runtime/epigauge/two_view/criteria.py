@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 
 from epigauge.kernels import Table
 
-__all__ = ["CRITERIA", "Criterion", "Distances", "FootPoints", "LineDistances", "Reprojection"]
+__all__ = [
+    "CRITERIA",
+    "Criterion",
+    "Distances",
+    "FootPoints",
+    "LineDistances",
+    "Mahalanobis",
+    "Reprojection",
+]
 
 Array = NDArray[np.float64]
 
@@ -105,7 +113,7 @@ class Reprojection:
         """
         frame = self.kernels.bilinear_frame(F)
         multiplier, change, d = self.kernels.foot_point(*frame, self.q1, self.q2)
-        unsettled = np.abs(change * d) > (_SETTLED * np.abs(d) + 1e-15) * np.abs(multiplier)
+        unsettled = _unsettled(multiplier, change, d)
         if unsettled.any():
             q1, q2 = self.q1[:, unsettled], self.q2[:, unsettled]
             safe = self.kernels.foot_point_safe(*frame, q1, q2)
@@ -139,6 +147,64 @@ class Reprojection:
         turn = np.kron(_padded(distances.frame[1]), _padded(distances.frame[0]))
         N_back = turn @ N @ turn.T
         return turn @ g, N_back, N_back if H is N else turn @ H @ turn.T
+
+
+class Mahalanobis(Reprojection):
+    """The exact reprojection error of matches with 2x2 covariances, in units of the noise.
+
+    With q = A q_white + (measured point) and A A^T the covariance, the noise of q_white is
+    isotropic of unit size, and the epipolar constraint stays bilinear: q2_white^T F_white q1_white
+    with F_white = L2^T F L1, L = [[A, q], [0, 1]], one for each match. Its foot point is exact; the
+    Hessian is that of Gauss-Newton, in `normal` with or without a curvature.
+
+    Parameters
+    ----------
+    kernels : Table
+        Backend.
+    q1, q2 : ndarray, shape (2, m)
+        Matches.
+    covariance1, covariance2 : ndarray, shape (m, 2, 2)
+        Symmetric positive definite.
+    """
+
+    def __init__(
+        self, kernels: Table, q1: Array, q2: Array, covariance1: Array, covariance2: Array
+    ) -> None:
+        super().__init__(kernels, q1, q2)
+        self.L1, self.L2 = _unwhitening(q1, covariance1), _unwhitening(q2, covariance2)
+        self._measured = np.zeros_like(q1)
+
+    def evaluate(self, F: Array) -> FootPoints:
+        """Find the foot point of every match."""
+        white = np.ascontiguousarray((np.swapaxes(self.L2, 1, 2) @ F @ self.L1).transpose(1, 2, 0))
+        frame = self.kernels.bilinear_frame(white)
+        origin = self._measured
+        multiplier, change, d = self.kernels.foot_point_each(*frame, origin, origin)
+        unsettled = _unsettled(multiplier, change, d)
+        if unsettled.any():
+            part = [np.ascontiguousarray(value[..., unsettled]) for value in (*frame, origin)]
+            safe = self.kernels.foot_point_safe_each(*part, part[-1])
+            multiplier[unsettled], _, d[unsettled] = safe
+        return FootPoints(frame, multiplier, d)
+
+    def corrected(self, feet: FootPoints) -> tuple[Array, Array, Array]:
+        """Return corrected matches, shape (2, m) each, and dd / d vect(F), shape (9, m)."""
+        white1, white2, by_white = self.kernels.foot_point_derivative_each(
+            *feet.frame, self._measured, self._measured, feet.multiplier
+        )
+        by_white = by_white.T.reshape(-1, 3, 3)
+        derivative = self.L2 @ by_white @ np.swapaxes(self.L1, 1, 2)
+        q1_hat = self.q1 + np.einsum("mij,jm->im", self.L1[:, :2, :2], white1)
+        q2_hat = self.q2 + np.einsum("mij,jm->im", self.L2[:, :2, :2], white2)
+        return q1_hat, q2_hat, derivative.reshape(-1, 9).T
+
+    def normal(
+        self, F: Array, distances: Distances, weight: Array, curvature: Array | None
+    ) -> tuple[Array, Array, Array]:
+        """Return gradient, and J^T J for both matrices."""
+        J = self.derivative(F, distances)
+        N = (J.T * weight) @ J
+        return J.T @ (weight * distances.signed), N, N
 
 
 @dataclass(frozen=True)
@@ -200,6 +266,20 @@ CRITERIA: dict[str, type[Reprojection] | type[Sampson] | type[Epipolar]] = {
     "sampson": Sampson,
     "epipolar": Epipolar,
 }
+
+
+def _unsettled(multiplier: Array, change: Array, d: Array) -> NDArray[np.bool_]:
+    """Return which foot points the last Newton step has still moved."""
+    return np.asarray(np.abs(change * d) > (_SETTLED * np.abs(d) + 1e-15) * np.abs(multiplier))
+
+
+def _unwhitening(q: Array, covariance: Array) -> Array:
+    """Return the (m, 3, 3) maps from white coordinates, zero at the measured points."""
+    L = np.zeros((q.shape[1], 3, 3))
+    L[:, :2, :2] = np.linalg.cholesky(covariance)
+    L[:, :2, 2] = q.T
+    L[:, 2, 2] = 1.0
+    return L
 
 
 def _padded(rotation: Array) -> Array:

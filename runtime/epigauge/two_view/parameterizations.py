@@ -280,9 +280,13 @@ class Reduced:
         Columns are the k directions left; a row of zeros freezes a parameter exactly.
     """
 
-    def __init__(self, inner: Parameterization, basis: Array) -> None:
+    def __init__(self, inner: Ortho | Block, basis: Array) -> None:
         self._inner, self._basis = inner, basis
         self.dimension = basis.shape[1]
+
+    def recombined(self, mixing: Array) -> Reduced:
+        """Return the same restriction with other parameters: `mixing` (k, k) times the new ones."""
+        return Reduced(self._inner, self._basis @ mixing)
 
     def start(self, F: Array) -> Any:
         """Return the inner representation."""
@@ -308,29 +312,50 @@ class Reduced:
 
 
 class Remapped:
-    """A parameterisation of F in other image coordinates than those that are computed in.
+    """A restricted parameterisation of F in other coordinates than those that are computed in.
 
     Freezing a part of F, or sigma = 1, means something in given coordinates only: the caller's
     pixels, or those of calibrated cameras.
 
     Parameters
     ----------
-    inner : Parameterization
+    inner : Reduced
         Of F in its own coordinates.
     to1, to2 : ndarray, shape (3, 3)
         Homogeneous maps of the images from its coordinates to those computed in.
+    anchor : ndarray, shape (3, 3), optional
+        The only F to start from, in its own coordinates: parts of it stay exactly as they are.
     """
 
-    def __init__(self, inner: Parameterization, to1: Array, to2: Array) -> None:
-        self._inner = inner
+    def __init__(self, inner: Reduced, to1: Array, to2: Array, anchor: Array | None = None) -> None:
+        self._inner, self._anchor = inner, anchor
         self._to1, self._to2 = to1, to2
         self._from1 = np.linalg.inv(to1)
         self._entries = np.kron(np.linalg.inv(to2).T, self._from1.T)
         self.dimension = inner.dimension
 
     def start(self, F: Array) -> Any:
-        """Return the inner representation."""
+        """Return the inner representation, of the anchor if there is one."""
+        if self._anchor is not None:
+            return self._inner.start(self._anchor)
         return self._inner.start(self._to2.T @ F @ self._to1)
+
+    def balanced(self, F: Array) -> Remapped:
+        """Return the same with parameters that move F at right angles and equally far.
+
+        Equally far in the coordinates computed in, at a start value: pixels, where an epipole moves
+        by 1e-6 or by 1, would otherwise give the damping a meaningless scale.
+        """
+        estimate = self.start(F)
+        f = self.fundamental(estimate).ravel()
+        derivative = self.derivatives(estimate)[0]
+        derivative -= np.outer(f, f @ derivative) / (f @ f)
+        sizes = np.maximum(np.linalg.norm(derivative, axis=0), np.finfo(float).tiny)
+        # The unit matrix below keeps the triangle regular where directions coincide
+        stacked = np.vstack([derivative / sizes, 1e-6 * np.eye(self.dimension)])
+        triangle = np.linalg.qr(stacked)[1] * sizes / np.linalg.norm(f)
+        inner = self._inner.recombined(np.linalg.inv(triangle))
+        return Remapped(inner, self._to1, self._to2, self._anchor)
 
     def fundamental(self, estimate: Any) -> Array:
         """Return F in the coordinates computed in."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +12,8 @@ from epigauge import kernels, lm
 from epigauge._arguments import (
     as_calibration,
     as_choice,
+    as_count,
+    as_covariances,
     as_fundamental,
     as_matches,
     as_positive,
@@ -19,20 +22,28 @@ from epigauge._arguments import (
 )
 from epigauge.errors import ArgumentError
 from epigauge.two_view.conditioning import condition
-from epigauge.two_view.covariance import fundamental_covariance
-from epigauge.two_view.criteria import CRITERIA, Reprojection
-from epigauge.two_view.geometry import canonical_cameras
+from epigauge.two_view.covariance import (
+    fundamental_covariance,
+    residual_noise,
+    restricted_basis,
+    robust_inflation,
+    tangent_basis,
+)
+from epigauge.two_view.criteria import CRITERIA
+from epigauge.two_view.essential import motion_from_essential
 from epigauge.two_view.initial import fundamental_8point
 from epigauge.two_view.joint import intersect
 from epigauge.two_view.losses import LOSSES
+from epigauge.two_view.minima import Search, search
 from epigauge.two_view.parameterizations import (
     PARAMETERIZATIONS,
     RESTRICTABLE,
     Ortho,
+    OrthonormalF,
     factorize,
 )
 from epigauge.two_view.result import FundamentalResult
-from epigauge.two_view.solve import DAMPINGS, REDUNDANT, Matches, Options, Solution, minimize
+from epigauge.two_view.solve import DAMPINGS, REDUNDANT, Matches, Options, Solution
 
 __all__ = ["refine_fundamental"]
 
@@ -49,6 +60,7 @@ def refine_fundamental(
     structure: str = "eliminated",
     damping: str = "levenberg",
     hessian: str = "exact",
+    starts: int = 1,
     fix: str | Sequence[str] = (),
     essential: bool = False,
     K1: ArrayLike | None = None,
@@ -57,6 +69,8 @@ def refine_fundamental(
     loss_scale_px: float | str = "auto",
     noise_px: float | None = 1.0,
     weights: ArrayLike | None = None,
+    covariance1: ArrayLike | None = None,
+    covariance2: ArrayLike | None = None,
     ftol: float = 1e-10,
     xtol: float = 1e-12,
     gtol: float = 1e-14,
@@ -89,9 +103,17 @@ def refine_fundamental(
         lambda I, or lambda diag(J^T J).
     hessian : {"exact", "gauss-newton"}
         Second derivatives for the eliminated structure; "joint" always uses Gauss-Newton.
+    starts : int
+        How many times to minimise: from `F0`, and from F0 plus random matrices that are the same at
+        every call, ten times as large as the standard deviation of F (`minima.perturbed`); 20 find
+        the best minimum of near-affine scenes. Of the minima that satisfy the oriented epipolar
+        constraint the lowest is returned; all are listed in ``result.minima``. Evaluations and
+        history count all starts, and `max_iter` holds for each.
     fix : str or sequence of str
         Parts of the start value to leave exactly as they are (B&S section 4.4): "epipole1",
-        "epipole2", "epipolar_transformation", in the coordinates of the images.
+        "epipole2", "epipolar_transformation", in the coordinates of the images. The last means
+        that sigma stays and that U and V turn with the epipoles but not about them; where this
+        leads depends slightly on the way the epipoles take.
     essential : bool
         Keep F the image of an essential matrix, sigma = 1 in calibrated coordinates: five
         parameters. The result then has E, R and t.
@@ -105,9 +127,17 @@ def refine_fundamental(
         residuals, anew until it stands still.
     noise_px : float or None
         Standard deviation of a coordinate in pixels, which scales the covariance only; None
-        estimates it from the residuals, as sqrt(2 cost / (m - 7)), m the matches of weight above 0.
+        estimates it from the residuals, as sqrt(sum(w d^2) / (m - p)), m the matches of weight
+        above 0 and p the parameters of F, and by their median with a robust loss.
     weights : array_like, shape (m,), optional
-        Factor of each match's squared distance.
+        Factor of each match's squared distance; for the covariance, (noise_px / standard deviation
+        of a coordinate of the match)^2.
+    covariance1, covariance2 : array_like, shape (2, 2) or (m, 2, 2), optional
+        Covariances of the points in px^2, for all or for each; the identity where only one is
+        given. Distances are then Mahalanobis distances to the epipolar geometry: `cost`, `fun`,
+        `loss_scale_px` and `noise_px` are in units of the noise, 1 being what the covariances
+        say. Only with the eliminated reprojection criterion, whose Hessian is then that of
+        Gauss-Newton.
     ftol, xtol, gtol : float
         Stop when the cost decreases by less than `ftol` times itself or is known to, when a step
         is shorter than `xtol`, when no entry of the gradient exceeds `gtol` (the last two in
@@ -161,13 +191,18 @@ def refine_fundamental(
         stopping=lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter),
     )
     _check_combination(options)
+    starts = as_count("starts", starts)
+    if starts > 1 and options.fix:
+        raise ArgumentError("starts", f"is {starts} with fix", "1: the start holds what is fixed")
     if noise_px is not None:
         noise_px = as_positive("noise_px", noise_px)
     w = np.ones(len(x1)) if weights is None else as_weights(weights, len(x1))
     start = _start(x1, x2, w) if F0 is None else _given_start(F0, x1, x2, w)
-    matches = Matches.of(x1, x2, w, start, kernels.table(backend))
-    solution = minimize(matches, options, matches.frame.from_pixels(start), callback)
-    return _result(solution, options, matches, noise_px)
+    covariances = _covariances(covariance1, covariance2, options, starts, len(x1))
+    matches = Matches.of(x1, x2, w, start, kernels.table(backend), covariances)
+    options = replace(options, anchor=start if options.fix else None)
+    found = search(matches, options, matches.frame.from_pixels(start), starts, callback)
+    return _result(found, options, matches, noise_px)
 
 
 def _parts(fix: str | Sequence[str]) -> tuple[str, ...]:
@@ -210,6 +245,30 @@ def _check_combination(options: Options) -> None:
         )
 
 
+def _covariances(
+    covariance1: ArrayLike | None,
+    covariance2: ArrayLike | None,
+    options: Options,
+    starts: int,
+    m: int,
+) -> tuple[Array, Array] | None:
+    """Return the covariances of both images, or None where all noise is equal."""
+    if covariance1 is None and covariance2 is None:
+        return None
+    joint = options.structure == "joint" or options.parameterization in REDUNDANT
+    if joint or options.criterion != "reprojection" or starts > 1:
+        raise ArgumentError(
+            "covariance1, covariance2",
+            "are given",
+            "criterion='reprojection', structure='eliminated', a minimal parameterization and one "
+            "start, or none of the two",
+        )
+    return (
+        as_covariances("covariance1", np.eye(2) if covariance1 is None else covariance1, m),
+        as_covariances("covariance2", np.eye(2) if covariance2 is None else covariance2, m),
+    )
+
+
 def _given_start(F0: ArrayLike, x1: Array, x2: Array, weights: Array) -> Array:
     """Check the caller's start value, in coordinates where its rank can be told."""
     F = as_fundamental(F0)
@@ -233,54 +292,68 @@ def _start(x1: Array, x2: Array, weights: Array) -> Array:
 
 
 def _result(
-    solution: Solution, options: Options, matches: Matches, noise_px: float | None
+    found: Search, options: Options, matches: Matches, noise_px: float | None
 ) -> FundamentalResult:
     """Bring the solution back to pixels and add what follows from it."""
-    frame, weights, outcome = matches.frame, matches.weights, solution.outcome
-    reprojection = Reprojection(matches.table, matches.q1, matches.q2)
+    solution, frame, weights = found.solution, matches.frame, matches.weights
+    outcome, chart = solution.outcome, solution.chart
+    reprojection = matches.reprojection()
     feet = reprojection.evaluate(solution.F)
-    q1_hat, q2_hat, _ = reprojection.corrected(feet)
+    q1_hat, q2_hat, feet_by_entries = reprojection.corrected(feet)
+    squared = feet.squared
+    if matches.covariances is not None:
+        squared = np.sum((q1_hat - matches.q1) ** 2 + (q2_hat - matches.q2) ** 2, axis=0)
     x1_hat, x2_hat = frame.backward(q1_hat, q2_hat)
     F = frame.to_pixels(solution.F)
-    P1, P2 = canonical_cameras(F)
+    factors = factorize(F)
+    if options.fix:
+        factors = _with_frozen(factors, solution, options)
+        F = (factors.U[:, :2] * [1.0, factors.sigma]) @ factors.V[:, :2].T
+        F = F / np.linalg.norm(F)
+    P2 = np.asarray(matches.table.canonical_camera(*factors))
     abc = intersect(P2, np.ascontiguousarray(x1_hat.T), np.ascontiguousarray(x2_hat.T))
     points = np.stack([abc[0], abc[1], np.ones(abc.shape[1]), abc[2]], axis=1)
-    criterion = CRITERIA[options.criterion](matches.table, matches.q1, matches.q2)
+    criterion = matches.criterion(options.criterion)
     distances = criterion.evaluate(solution.F)
-    by_entries = criterion.derivative(solution.F, distances)
     loss = options.scaled_loss(solution.loss_scale_px / frame.scale)
     weight = weights * loss(distances.squared)[1]
-    cost = outcome.state.cost * frame.scale**2
+    derivatives = chart.derivatives(solution.motion)[0]
+    residual = residual_noise(distances.signed, weights, loss, chart.dimension)
     if noise_px is None:
-        noise_px = float(np.sqrt(2.0 * cost / max(np.count_nonzero(weights) - 7, 1)))
+        noise = found.evidence.noise if matches.covariances is None else residual
+        noise_px = noise * frame.scale
+    kappa = robust_inflation(distances.signed, weights, loss, chart.dimension, residual)
     # Derivatives are by F of the norm it has inside; those by F of unit norm are so much larger.
     norm = float(np.linalg.norm(solution.F))
+    unit = solution.F / norm
+    restricted = chart.dimension < 7
     uncertainty = fundamental_covariance(
-        solution.F / norm,
-        norm**2 * (by_entries.T * weight) @ by_entries,
-        (noise_px / frame.scale) ** 2,
-        frame.entry_map(),
+        unit,
+        norm**2 * (feet_by_entries * weights) @ feet_by_entries.T,
+        kappa * (noise_px / frame.scale) ** 2,
+        frame.maps_from_pixels(),
+        restricted_basis(unit, derivatives) if restricted else tangent_basis(unit),
     )
-    jac = frame.scale * by_entries @ solution.chart.derivatives(solution.motion)[0]
+    jac = frame.scale * criterion.derivative(solution.F, distances) @ derivatives
     fun = frame.scale * distances.signed
     grad = jac.T @ (weight * fun)
-    factors = factorize(F)
+    E, R, t = _essential(options, F, x1_hat, x2_hat)
     return FundamentalResult(
         F=F,
         U=factors.U,
         V=factors.V,
         sigma=float(factors.sigma),
-        P1=P1,
+        P1=np.eye(3, 4),
         P2=P2,
         points=points / np.linalg.norm(points, axis=1, keepdims=True),
-        covariance=uncertainty.covariance,
+        covariance=uncertainty.of_fundamental(),
         rank=uncertainty.rank,
         condition=uncertainty.condition,
         noise_px=noise_px,
-        rms_px=float(frame.scale * np.sqrt(np.mean(feet.squared) / 4.0)),
+        rms_px=float(frame.scale * np.sqrt(np.mean(squared) / 4.0)),
         loss_scale_px=solution.loss_scale_px,
         x=F.ravel(),
-        cost=cost,
+        cost=outcome.state.cost * frame.scale**2,
         fun=fun,
         jac=jac,
         grad=grad,
@@ -292,4 +365,42 @@ def _result(
         message=lm.STATUS[outcome.status],
         success=outcome.status > 0,
         history=outcome.history,
+        minima=found.minima,
+        ambiguous=found.ambiguous,
+        E=E,
+        R=R,
+        t=t,
+        _uncertainty=uncertainty,
+        _evidence=found.evidence,
     )
+
+
+def _with_frozen(factors: OrthonormalF, solution: Solution, options: Options) -> OrthonormalF:
+    """Return the factors in pixels with the frozen parts exactly as they were, not as rounded."""
+    if "epipolar_transformation" in options.fix:
+        return OrthonormalF(*solution.motion)
+    assert options.anchor is not None
+    U, V = factors.U.copy(), factors.V.copy()
+    start = factorize(options.anchor)
+    if "epipole1" in options.fix:
+        V[:, 2] = start.V[:, 2]
+    if "epipole2" in options.fix:
+        U[:, 2] = start.U[:, 2]
+    return OrthonormalF(U, V, factors.sigma)
+
+
+def _essential(
+    options: Options, F: Array, x1_hat: Array, x2_hat: Array
+) -> tuple[Array | None, Array | None, Array | None]:
+    """Return E and the motion of calibrated cameras, None where they are not calibrated."""
+    if options.calibration is None:
+        return None, None, None
+    K1, K2 = options.calibration
+    E = K2.T @ F @ K1
+    R, t = motion_from_essential(E, _rays(K1, x1_hat), _rays(K2, x2_hat))
+    return E / np.linalg.norm(E), R, t
+
+
+def _rays(K: Array, x: Array) -> Array:
+    """Return the directions (m, 3) of pixels in the camera's frame."""
+    return np.asarray(np.linalg.solve(K, np.vstack([x.T, np.ones(len(x))])).T)

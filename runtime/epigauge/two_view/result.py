@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.errors import ArgumentError
 from epigauge.lm import Row
+from epigauge.two_view.covariance import Uncertainty
+from epigauge.two_view.diagnostics import Evidence, diagnose
+from epigauge.two_view.minima import Minimum
 
 __all__ = ["FundamentalResult"]
 
@@ -31,10 +36,14 @@ class FundamentalResult:
     points : ndarray, shape (m, 4)
         Reconstructed points, homogeneous of unit norm, in the basis of P1, P2.
     covariance : ndarray, shape (9, 9)
-        Covariance of vect(F) to first order, of rank 7; its diagonal is infinite where the matches
-        do not determine F.
+        Covariance of vect(F) to first order, of rank 7, or 5 for an essential matrix, or fewer by
+        the parameters fixed; its diagonal is infinite where the matches do not determine F. It is
+        ``noise_px^2 (J^T W J)^-1`` with the weights W, which are taken for inverse variances in
+        units of 1 / noise_px^2, times the factor of an M-estimate with a robust loss
+        (`epigauge.two_view.covariance.robust_inflation`). J is that of the reprojection error
+        whatever the criterion, whose minimum has the same covariance to first order.
     rank : int
-        Number of the 7 directions of F that the matches determine.
+        Number of free directions of F that the matches determine: 7 if nothing is held fixed.
     condition : float
         Largest over smallest standard deviation among them, in conditioned coordinates.
     noise_px : float
@@ -56,7 +65,7 @@ class FundamentalResult:
     optimality : float
         Largest absolute entry of `grad`.
     nfev, njev, nit : int
-        Evaluations of the cost including the start, linearisations, trial steps.
+        Evaluations of the cost including the start, linearisations, trial steps; of all starts.
     status : int
         Reason for stopping as in `epigauge.lm.STATUS`; positive is success.
     message : str
@@ -64,7 +73,19 @@ class FundamentalResult:
     success : bool
         Whether `status` is positive.
     history : tuple of Row
-        One row an evaluation of the cost.
+        One row an evaluation of the cost, of all starts one after the other.
+    minima : tuple of Minimum
+        The local minima that the starts ended in, by rising cost. The result is the lowest of those
+        that satisfy the oriented epipolar constraint, or the lowest if none does ("not oriented").
+    ambiguous : bool
+        Whether another oriented minimum is within the noise of the result:
+        ``2 (its cost - cost) <= 9 s^2``, three standard deviations, with the noise s estimated from
+        the residuals of the result whatever `noise_px` says, since a wrong `noise_px` would hide a
+        rival or make one up.
+    E, R, t : ndarray, shape (3, 3), (3, 3), (3,), or None
+        With ``essential=True``: the essential matrix of unit norm with ``E = K2^T F K1`` up to
+        scale, and the motion ``x2 = R x1 + t`` of unit length that puts most points in front of
+        both cameras.
     """
 
     F: Array
@@ -93,3 +114,78 @@ class FundamentalResult:
     message: str
     success: bool
     history: tuple[Row, ...] = field(repr=False)
+    minima: tuple[Minimum, ...] = field(repr=False)
+    ambiguous: bool
+    E: Array | None
+    R: Array | None
+    t: Array | None
+    _uncertainty: Uncertainty = field(repr=False)
+    _evidence: Evidence = field(repr=False)
+
+    @property
+    def epipole1(self) -> Array:
+        """Epipole in image 1, a homogeneous unit vector (3,) in pixels: F e = 0."""
+        return self.V[:, 2]
+
+    @property
+    def epipole2(self) -> Array:
+        """Epipole in image 2, a homogeneous unit vector (3,) in pixels: F^T e' = 0."""
+        return self.U[:, 2]
+
+    @property
+    def sigma_std(self) -> float:
+        """Standard deviation of sigma, for Gaussian errors of F.
+
+        Finite at sigma = 1 too, where the two singular values change places and sigma has a kink:
+        it is then the deviation of a folded distribution, since sigma cannot exceed 1.
+        """
+        return self._uncertainty.of_sigma()
+
+    @cached_property
+    def flags(self) -> tuple[str, ...]:
+        """What the matches do not support, computed when asked for.
+
+        Names from `epigauge.two_view.diagnostics.FLAGS`, which explains them; the tests are in
+        `epigauge.two_view.diagnostics.diagnose`. They use the noise of the residuals.
+        """
+        found = self._evidence
+        estimated_px = found.noise / found.to_units1[0, 0]
+        deviation = self._uncertainty.largest() * estimated_px / self.noise_px
+        return diagnose(found, deviation, self.ambiguous)
+
+    def epipole_covariance(self, image: int) -> Array:
+        """Return the covariance (3, 3) of `epipole1` or `epipole2`, of rank 2.
+
+        Parameters
+        ----------
+        image : {1, 2}
+            Which epipole.
+
+        Returns
+        -------
+        ndarray, shape (3, 3)
+            To first order; its diagonal is infinite where the matches do not determine the epipole.
+        """
+        return self._uncertainty.of_epipole(_image(image))
+
+    def epipole_px_covariance(self, image: int) -> Array:
+        """Return the covariance (2, 2) of an epipole in pixels, ``epipole[:2] / epipole[2]``.
+
+        Parameters
+        ----------
+        image : {1, 2}
+            Which epipole.
+
+        Returns
+        -------
+        ndarray, shape (2, 2)
+            To first order, which is good while the epipole is many deviations from infinity; its
+            diagonal is infinite for an epipole at infinity or not determined.
+        """
+        return self._uncertainty.of_epipole_px(_image(image))
+
+
+def _image(image: int) -> int:
+    if image not in (1, 2):
+        raise ArgumentError("image", f"is {image!r}", "1 or 2")
+    return image

@@ -17,7 +17,7 @@ from epigauge import lm
 from epigauge.kernels import Table
 from epigauge.linear import Levenberg, Seber
 from epigauge.two_view.conditioning import Conditioning, condition, displaced
-from epigauge.two_view.criteria import CRITERIA
+from epigauge.two_view.criteria import CRITERIA, Criterion, Mahalanobis, Reprojection
 from epigauge.two_view.eliminated import EliminatedProblem
 from epigauge.two_view.free import FreeProblem
 from epigauge.two_view.joint import JointProblem
@@ -33,7 +33,7 @@ from epigauge.two_view.parameterizations import (
     frozen_directions,
 )
 
-__all__ = ["DAMPINGS", "REDUNDANT", "Matches", "Options", "Solution", "minimize"]
+__all__ = ["DAMPINGS", "REDUNDANT", "Matches", "Options", "Solution", "joined", "minimize"]
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,10 @@ _SCALE_ROUNDS = 10
 
 @dataclass(frozen=True)
 class Options:
-    """The choices of `refine_fundamental`, checked."""
+    """The choices of `refine_fundamental`, checked.
+
+    `anchor` is the F in pixels whose parts `fix` leaves as they are.
+    """
 
     parameterization: str = "ortho"
     criterion: str = "reprojection"
@@ -57,6 +60,7 @@ class Options:
     damping: str = "levenberg"
     hessian: str = "exact"
     fix: tuple[str, ...] = ()
+    anchor: Array | None = None
     calibration: tuple[Array, Array] | None = None
     loss: str = "linear"
     loss_scale_px: float | None = None
@@ -81,6 +85,8 @@ class Matches:
         Matches.
     weights : ndarray, shape (m,)
         Factor of the cost of each match.
+    covariances : tuple of ndarray, shape (m, 2, 2) each, or None
+        In pixels: distances, times ``frame.scale``, are then in units of the noise.
     """
 
     table: Table
@@ -88,14 +94,34 @@ class Matches:
     q1: Array
     q2: Array
     weights: Array
+    covariances: tuple[Array, Array] | None = None
 
     @staticmethod
-    def of(x1: Array, x2: Array, weights: Array, F: Array, table: Table) -> Matches:
+    def of(
+        x1: Array,
+        x2: Array,
+        weights: Array,
+        F: Array,
+        table: Table,
+        covariances: tuple[Array, Array] | None = None,
+    ) -> Matches:
         """Condition matches in pixels around those that count, for a start value in pixels."""
         counts = weights > 0.0
         frame = condition(x1[counts], x2[counts])
         frame = displaced(frame, frame.from_pixels(F))
-        return Matches(table, frame, *frame.forward(x1, x2), weights)
+        return Matches(table, frame, *frame.forward(x1, x2), weights, covariances)
+
+    def reprojection(self) -> Reprojection:
+        """Return the exact criterion."""
+        if self.covariances is not None:
+            return Mahalanobis(self.table, self.q1, self.q2, *self.covariances)
+        return Reprojection(self.table, self.q1, self.q2)
+
+    def criterion(self, name: str) -> Criterion:
+        """Return a criterion by name."""
+        if name == "reprojection":
+            return self.reprojection()
+        return CRITERIA[name](self.table, self.q1, self.q2)
 
 
 @dataclass(frozen=True)
@@ -156,7 +182,7 @@ def minimize(
     for _ in range(_SCALE_ROUNDS):
         fixed = replace(options, loss_scale_px=scale)
         solution = _minimize_once(matches, fixed, start, callback)
-        history = _joined(history, solution.outcome.history)
+        history = joined(history, solution.outcome.history)
         njev += solution.outcome.njev
         start = solution.F
         previous, scale = scale, _estimated_scale(matches, options, start)
@@ -175,7 +201,7 @@ def _minimize_once(
 ) -> Solution:
     scale_px = 0.0 if options.loss_scale_px is None else options.loss_scale_px
     loss = options.scaled_loss(scale_px / matches.frame.scale)
-    chart = _chart(matches, options)
+    chart = _chart(matches, options, start)
     problem = _problem(matches, options, chart, loss)
     outcome: lm.Outcome[Any] = lm.minimize(
         problem,
@@ -195,8 +221,8 @@ def _minimize_once(
     return Solution(chart.fundamental(motion), chart, motion, outcome, scale_px)
 
 
-def _chart(matches: Matches, options: Options) -> Parameterization:
-    """Return the minimal parameterisation, restricted as asked for."""
+def _chart(matches: Matches, options: Options, start: Array) -> Parameterization:
+    """Return the minimal parameterisation, restricted as asked for, suited to a start value."""
     name = "ortho" if options.parameterization in REDUNDANT else options.parameterization
     kind = PARAMETERIZATIONS[name]
     chart: Parameterization = kind(matches.table)
@@ -204,9 +230,17 @@ def _chart(matches: Matches, options: Options) -> Parameterization:
     if options.calibration is not None:
         K1, K2 = options.calibration
         return Remapped(Ortho.essential(matches.table), to1 @ K1, to2 @ K2)
+    if "epipolar_transformation" in options.fix:
+        # Its coordinates are those of the pixels. Here both charts move alike; only in this one
+        # sigma is a number that stays to the last bit.
+        basis = frozen_directions(Ortho.parts, options.fix)
+        inner = Reduced(Ortho(matches.table), basis)
+        return Remapped(inner, to1, to2, options.anchor).balanced(start)
     if options.fix:
-        basis = frozen_directions(RESTRICTABLE[name].parts, options.fix)
-        return Remapped(Reduced(chart, basis), to1, to2)
+        # An epipole that stays in pixels stays in all coordinates
+        restrictable = RESTRICTABLE[name]
+        basis = frozen_directions(restrictable.parts, options.fix)
+        return Reduced(restrictable(matches.table), basis)
     return chart
 
 
@@ -221,20 +255,20 @@ def _problem(
         return JointProblem(table, ParFree(table), q1, q2, weights, loss)
     if options.structure == "joint":
         return JointProblem(table, chart, q1, q2, weights, loss)
-    criterion = CRITERIA[options.criterion](table, q1, q2)
+    criterion = matches.criterion(options.criterion)
     return EliminatedProblem(criterion, chart, weights, loss, options.hessian == "exact")
 
 
 def _estimated_scale(matches: Matches, options: Options, F: Array) -> float:
     """Return the scale of the loss, in pixels, at which it is 95 % efficient for clean data."""
-    criterion = CRITERIA[options.criterion](matches.table, matches.q1, matches.q2)
+    criterion = matches.criterion(options.criterion)
     counts = matches.weights > 0.0
     sigma = robust_scale(criterion.evaluate(F).signed[counts])
     # Noise-free data: any scale will do that is not zero.
     return EFFICIENT[options.loss] * max(sigma, 1e-12) * matches.frame.scale
 
 
-def _joined(first: tuple[lm.Row, ...], second: tuple[lm.Row, ...]) -> tuple[lm.Row, ...]:
+def joined(first: tuple[lm.Row, ...], second: tuple[lm.Row, ...]) -> tuple[lm.Row, ...]:
     """Return two histories as one."""
     if not first:
         return second

@@ -1,7 +1,4 @@
-"""Pictures of a refined fundamental matrix, by Matplotlib without its global state.
-
-Matplotlib is imported only when a picture is made: ``pip install 'epigauge[plot]'``.
-"""
+"""Pictures of a refined fundamental matrix."""
 
 from __future__ import annotations
 
@@ -12,10 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge._arguments import as_matches
-from epigauge.errors import ArgumentError, MissingPackageError
-from epigauge.io._common import PathLike, check_suffix
-from epigauge.io.output import writing
-from epigauge.lm import Row
+from epigauge.errors import ArgumentError
+from epigauge.plots._style import BLUE, GREY, RED, draw_history, finish, heading, new_figure
 from epigauge.two_view.geometry import reprojection_distances
 from epigauge.two_view.result import FundamentalResult
 
@@ -23,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_refinement", "save_figure"]
+__all__ = ["plot_refinement"]
 
 Array = NDArray[np.float64]
 Size = tuple[int, int]
@@ -31,7 +26,6 @@ Box = tuple[float, float, float, float]
 
 _LINES = 12  # epipolar lines shown: enough to see the pencil, few enough to follow each
 _WIDTH = 11.0  # inches
-_GREY, _BLUE, _RED = "0.45", "#2a6f97", "#c1121f"
 
 
 def plot_refinement(
@@ -72,12 +66,6 @@ def plot_refinement(
     MissingPackageError
         If Matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-        from matplotlib.layout_engine import ConstrainedLayoutEngine
-    except ImportError:
-        raise MissingPackageError("matplotlib", "plot") from None
-
     points = as_matches(x1, x2, at_least=1)
     F = np.asarray(result.F, dtype=np.float64)
     d, *feet = reprojection_distances(F, points[0], points[1])
@@ -86,9 +74,9 @@ def plot_refinement(
 
     aspect = max((y1 - y0) / (x1 - x0) for x0, x1, y0, y1 in boxes)
     top = min(max(0.5 * _WIDTH * aspect, 2.0), 6.0)
-    layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.1, hspace=0.04)
-    figure = Figure(figsize=(_WIDTH, top + 4.0), dpi=110, layout=layout)
-    _heading(figure, result, len(d))
+    figure = new_figure(_WIDTH, top + 4.0)
+    text = f"Fundamental matrix from {len(d)} matches: RMS {result.rms_px:.4g} px per coordinate"
+    heading(figure, text, "" if result.success else result.message)
     grid = figure.add_gridspec(2, 2, height_ratios=(top, 3.0))
 
     chosen = _spread_over_pencil(F, feet[0], feet[1], boxes[1])
@@ -99,42 +87,8 @@ def plot_refinement(
         _draw_view(axes, points[view], feet[view], chosen, lines, boxes[view], photos[view])
         _draw_epipole(axes, _null_vector(matrix.T), boxes[view], view + 1)
     _draw_distances(figure.add_subplot(grid[1, 0]), d)
-    _draw_history(figure.add_subplot(grid[1, 1]), result.history)
+    draw_history(figure.add_subplot(grid[1, 1]), result.history)
     return figure
-
-
-def save_figure(figure: Figure, path: PathLike) -> None:
-    """Write a picture as PNG or SVG; the same picture gives the same bytes.
-
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-        The picture.
-    path : str or path
-        The file; ``.png`` or ``.svg`` chooses the form.
-
-    Raises
-    ------
-    ArgumentError
-        If the suffix is neither of these.
-    OSError
-        If the file cannot be written.
-    """
-    suffix = check_suffix(path, ".png", ".svg")
-    from matplotlib import rc_context
-
-    undated = {"Software": None} if suffix == ".png" else {"Date": None, "Creator": None}
-    with writing(path) as file, rc_context({"svg.hashsalt": "epigauge"}):
-        figure.savefig(file, format=suffix[1:], metadata=undated)
-
-
-def _heading(figure: Figure, result: FundamentalResult, m: int) -> None:
-    """Write over the picture what was done and how well it fits."""
-    text = f"Fundamental matrix from {m} matches: RMS {result.rms_px:.4g} px per coordinate"
-    if not result.success:
-        text += f"  (not converged: {result.message})"
-    colour = "black" if result.success else _RED
-    figure.suptitle(text, x=0.01, ha="left", fontsize=13, color=colour)
 
 
 def _draw_view(
@@ -163,7 +117,7 @@ def _draw_view(
         x, y = points[index]
         axes.scatter(x, y, color=shade, s=42, ec="white", lw=1.0, zorder=4)
     axes.set(xlim=box[:2], ylim=box[3:1:-1], aspect="equal", xlabel="x (px)", ylabel="y (px)")
-    axes.tick_params(labelsize=8, color=_GREY)
+    axes.tick_params(labelsize=8, color=GREY)
     for spine in axes.spines.values():
         spine.set_color("0.75")
 
@@ -183,7 +137,7 @@ def _draw_epipole(axes: Axes, epipole: Array, box: Box, view: int) -> None:
             axes.plot(x, y, "+", ms=17, mew=4.5, color="white", zorder=5)
             axes.plot(x, y, "+", ms=15, mew=2.0, color="black", zorder=6)
     axes.set_title(f"Image {view}", loc="left", fontsize=11)
-    axes.set_title(where, loc="right", fontsize=9, color=_GREY)
+    axes.set_title(where, loc="right", fontsize=9, color=GREY)
 
 
 def _draw_distances(axes: Axes, d: Array) -> None:
@@ -195,59 +149,17 @@ def _draw_distances(axes: Axes, d: Array) -> None:
     limit = min(float(np.abs(d).max()), max(4.0 * sigma, 1e-300), max(8.0 * typical, 1e-300)) or 1.0
     bins = int(np.clip(2.0 * np.sqrt(m), 10, 60))
     edges = np.linspace(-limit, limit, bins + 1)
-    axes.hist(d, bins=edges.tolist(), color=_BLUE, alpha=0.55, ec="white", lw=0.6, label="matches")
+    axes.hist(d, bins=edges.tolist(), color=BLUE, alpha=0.55, ec="white", lw=0.6, label="matches")
     if sigma > 0.0:
         t = np.linspace(-limit, limit, 400)
         bell = np.exp(-0.5 * (t / sigma) ** 2) * m * (edges[1] - edges[0])
         bell /= sigma * np.sqrt(2.0 * np.pi)
-        axes.plot(t, bell, color=_RED, lw=1.6, label=f"Gaussian, {sigma:.3g} px")
+        axes.plot(t, bell, color=RED, lw=1.6, label=f"Gaussian, {sigma:.3g} px")
     beyond = int(np.sum(np.abs(d) > limit))
     if beyond:
         axes.plot([], [], " ", label=f"{beyond} farther away")
     axes.set(xlabel="signed distance to the epipolar geometry (px)", ylabel="matches")
-    _finish(axes, "Residuals")
-
-
-def _draw_history(axes: Axes, history: Sequence[Row]) -> None:
-    """Draw the cost of each evaluation, less the lowest, accepted and rejected steps apart."""
-    from matplotlib.ticker import MaxNLocator
-
-    cost = np.array([row.cost for row in history], dtype=np.float64)
-    accepted = np.array([row.accepted for row in history], dtype=np.bool_)
-    accepted[:1] = True  # the start
-    shown = np.isfinite(cost)
-    lowest = float(cost[accepted & shown].min(initial=np.inf))
-    above = np.where(shown, cost - lowest, np.nan)
-    positive = above[above > 0.0]
-    floor = float(positive.min()) / 4.0 if len(positive) else 1.0
-    at = np.arange(1, len(cost) + 1)
-    drawn = np.maximum(above, floor)
-    axes.plot(at[accepted], drawn[accepted], "-", color=_BLUE, lw=1.4, zorder=2)
-    higher = accepted & (above > 0.0)
-    style = {"ls": "", "color": _BLUE, "ms": 6}
-    axes.plot(at[higher], drawn[higher], marker="o", label="accepted", **style)  # type: ignore[arg-type]
-    last = accepted & ~(above > 0.0)
-    label = f"lowest: {lowest:.6g} px\N{SUPERSCRIPT TWO}"
-    axes.plot(at[last], drawn[last], marker="v", label=label, **style | {"ms": 8})  # type: ignore[arg-type]
-    rejected = ~accepted & shown
-    if rejected.any():
-        cross = {"ls": "", "marker": "x", "color": _RED, "ms": 7, "mew": 1.8}
-        axes.plot(at[rejected], drawn[rejected], label="rejected", **cross)  # type: ignore[arg-type]
-    axes.set_yscale("log")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set(xlabel="evaluation", ylabel="cost above the lowest (px\N{SUPERSCRIPT TWO})")
-    _finish(axes, "Convergence")
-
-
-def _finish(axes: Axes, title: str) -> None:
-    """Give the lower panels their common look."""
-    axes.set_title(title, loc="left", fontsize=11)
-    axes.grid(color="0.9", lw=0.7)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color("0.6")
-    axes.tick_params(labelsize=8, color=_GREY)
-    axes.legend(fontsize=9, frameon=False)
+    finish(axes, "Residuals")
 
 
 def _spread_over_pencil(F: Array, x1: Array, x2: Array, box: Box) -> list[int]:

@@ -1,0 +1,75 @@
+"""``epigauge reproduce``: the experiments of the papers, with a report."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Iterable, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.progress import track
+
+import epigauge as eg
+from epigauge._arguments import as_count
+from epigauge.cli._common import DONE, console, shown
+from epigauge.cli.info import processor, version
+from epigauge.reproduce import bs2004
+from epigauge.reproduce.common import Study
+
+
+class Paper(StrEnum):
+    """The papers whose experiments can be repeated."""
+
+    bs2004 = "bs2004"
+
+
+def reproduce(
+    paper: Annotated[Paper, typer.Argument(help="Bartoli & Sturm 2004.")],
+    only: Annotated[
+        list[str] | None, typer.Option(help=f"Experiments: {', '.join(bs2004.EXPERIMENTS)}.")
+    ] = None,
+    trials: Annotated[int, typer.Option(help="Trials a configuration; the paper has 100.")] = 10,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Directory for the report; made if absent.")
+    ] = Path(),
+    seed: Annotated[int, typer.Option(help="Seed of the first trial.")] = 0,
+) -> int:
+    """Repeat the experiments of a paper: tables, figures, and each claim checked.
+
+    Writes bs2004.md, bs2004.html and the directory bs2004 with CSV and PNG
+    files. Several experiments are separated by commas or by repeating --only.
+    The measured image pairs of Table 4 are looked for in the folder pairs of
+    EPIGAUGE_DATA, or of ../shared/data.
+    """
+    as_count("--trials", trials)
+    as_count("--seed", seed, at_least=0)
+    out = console()
+    names = [name for names in only or () for name in names.split(",")]
+
+    def progress(items: Sequence[Any], label: str) -> Iterable[Any]:
+        return track(items, label, console=out, transient=True, disable=not out.is_terminal)
+
+    study = Study(trials, seed, _pairs(), progress)
+    for path in bs2004.reproduce(output, study, _machine(), names):
+        out.print(escape(shown(path)), soft_wrap=True)
+    return DONE
+
+
+def _pairs() -> Path | None:
+    """Return the directory of measured pairs, or None."""
+    directory = Path(os.environ.get("EPIGAUGE_DATA", Path("..", "shared", "data"))) / "pairs"
+    return directory if directory.is_dir() else None
+
+
+def _machine() -> dict[str, str]:
+    """Describe the processor and the versions."""
+    return {
+        "Processor": f"{processor()}, {os.cpu_count()} cores",
+        "Python": platform.python_version(),
+        "NumPy": str(version("numpy")),
+        "epigauge": f"{eg.__version__}, backend {eg.backend()}",
+    }

@@ -1,0 +1,363 @@
+"""Tracks of many views and reconstructions: NPZ, CSV and BAL."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.errors import ArgumentError, FileFormatError
+from epigauge.io._bal import read_bal, write_bal
+from epigauge.io._common import MAX_MATCHES, PathLike, check_suffix, listed
+from epigauge.io._npz import read_npz
+from epigauge.io._text import Columns, read_text
+from epigauge.io.output import writing
+from epigauge.multi_view.tracks import Reconstruction, Tracks
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+_COLUMNS = Columns(
+    "observations", ("view", "point", "x", "y"), indices=("view", "point"), flags=("clean",)
+)
+_TRACKS = ("view", "point", "xy")
+_SUFFIXES = (".npz", ".csv", ".txt", ".txt.bz2", ".txt.gz")
+
+
+@dataclass(frozen=True)
+class TrackFile:
+    """What a file of tracks holds.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Observations.
+    start : Reconstruction or None
+        Cameras and points, where the file has both.
+    views, points : ndarray of int
+        The numbers in the file of the views and points of the tracks.
+    """
+
+    tracks: Tracks
+    start: Reconstruction | None
+    views: Indices
+    points: Indices
+
+
+def load_tracks(path: PathLike, clean: bool = False, views: Iterable[int] | None = None) -> Tracks:
+    """Read tracks from an NPZ, CSV or BAL file.
+
+    NPZ: arrays ``view``, ``point`` (N,) and ``xy`` (N, 2); optionally ``weights`` (N,), ``clean``
+    (one mark a point), ``n_views`` and ``n_points``. CSV: columns view, point, x, y, or a first
+    line with the names of the columns: these in any order, optionally ``weight`` and ``clean``
+    (one mark an observation). BAL (``.txt``, ``.txt.bz2``, ``.txt.gz``): the observations.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+    clean : bool
+        Keep only what the file marks as clean.
+    views : iterable of int, optional
+        Keep only these views.
+
+    Returns
+    -------
+    Tracks
+        With `clean` or `views`, views and points left with too few observations are dropped, and
+        the rest numbered anew, in the same order; without, such a file is refused.
+
+    Raises
+    ------
+    FileFormatError
+        If the file does not hold tracks in this form, naming the line where there is one.
+    OSError
+        If the file cannot be read.
+    """
+    return load_track_file(path, clean, views, with_start=False).tracks
+
+
+def load_track_file(
+    path: PathLike,
+    clean: bool = False,
+    views: Iterable[int] | None = None,
+    *,
+    with_start: bool = True,
+) -> TrackFile:
+    """Read tracks, the reconstruction that comes with them, and the numbers they had in the file.
+
+    Parameters
+    ----------
+    path, clean, views
+        As for `load_tracks`.
+    with_start : bool
+        Read the reconstruction too, where there is one.
+
+    Returns
+    -------
+    TrackFile
+        The reconstruction is that of the views and points of the tracks.
+
+    Raises
+    ------
+    FileFormatError, OSError
+        As for `load_tracks`.
+    """
+    path = Path(path)
+    found = _read(path, with_start)
+    if "view" not in found:
+        raise FileFormatError(path, "holds a reconstruction but no tracks: view, point and xy")
+    view, point, xy = _observations(path, found)
+    keep = _kept(path, found, view, point, clean, views)
+    start = _reconstruction(path, found)
+    weights = found.get("weights")
+    try:
+        if keep is None:
+            n_views, n_points = (_count(path, f"n_{name}s", found) for name in ("view", "point"))
+            tracks = Tracks(view, point, xy, n_views, n_points, weights)
+            old_views, old_points = np.arange(tracks.n_views), np.arange(tracks.n_points)
+        else:
+            if weights is not None and weights.shape == keep.shape:
+                weights = weights[keep]
+            tracks, old_views, old_points = Tracks.pruned(
+                view[keep], point[keep], xy[keep], weights
+            )
+    except ArgumentError as error:
+        raise FileFormatError(path, str(error)) from None
+    if start is not None:
+        if len(start.P) <= old_views[-1] or len(start.Q) <= old_points[-1]:
+            reason = f"has {len(start.P)} cameras and {len(start.Q)} points but tracks of more"
+            raise FileFormatError(path, reason)
+        start = Reconstruction(start.P[old_views], start.Q[old_points])
+    return TrackFile(tracks, start, old_views, old_points)
+
+
+def load_reconstruction(path: PathLike) -> Reconstruction:
+    """Read cameras and points from an NPZ or BAL file.
+
+    NPZ: arrays ``P`` (n, 3, 4) and ``Q`` (m, 4), or ``X`` of three or four columns. BAL:
+    P = diag(-f, -f, 1) (R | t), without the distortion.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+
+    Returns
+    -------
+    Reconstruction
+        Of all views and points in the file.
+
+    Raises
+    ------
+    FileFormatError
+        If the file does not hold them.
+    OSError
+        If the file cannot be read.
+    """
+    path = Path(path)
+    start = _reconstruction(path, _read(path, with_start=True))
+    if start is None:
+        raise FileFormatError(path, "holds no reconstruction: P (n, 3, 4) and Q or X (m, 4)")
+    return start
+
+
+def save_tracks(path: PathLike, tracks: Tracks, start: Reconstruction | None = None) -> None:
+    """Write tracks so that `load_tracks` reads the same numbers again, to the last bit.
+
+    Parameters
+    ----------
+    path : str or path
+        The file; ``.npz``, ``.csv``, ``.txt``, ``.txt.bz2`` or ``.txt.gz`` (the last three: BAL)
+        chooses the form.
+    tracks : Tracks
+        What to write.
+    start : Reconstruction, optional
+        Cameras and points to write too. BAL needs them, and in its own form: cameras
+        diag(-f, -f, 1) (R | t) up to scale and no point at infinity. CSV has no place for them.
+
+    Raises
+    ------
+    ArgumentError
+        If the suffix is none of these, or the form cannot hold what is given.
+    OSError
+        If the file cannot be written.
+    """
+    form = _form(path)
+    if (start is None) != (form == ".csv") and form != ".npz":
+        needed = "none for CSV" if form == ".csv" else "cameras and points, which BAL holds too"
+        raise ArgumentError("start", "is given" if form == ".csv" else "is None", needed)
+    if start is not None and (len(start.P), len(start.Q)) != (tracks.n_views, tracks.n_points):
+        was = f"has {len(start.P)} cameras and {len(start.Q)} points"
+        raise ArgumentError("start", was, f"{tracks.n_views} and {tracks.n_points}, as the tracks")
+    with writing(path) as file:
+        if form == ".npz":
+            arrays = arrays_of(tracks) | ({} if start is None else {"P": start.P, "Q": start.Q})
+            np.savez_compressed(file, **arrays)
+        elif form == ".csv":
+            _write_csv(file, tracks)
+        else:
+            assert start is not None
+            with _compressing(file, form) as stream:
+                write_bal(stream, tracks, start)
+
+
+def save_reconstruction(path: PathLike, reconstruction: Reconstruction) -> None:
+    """Write cameras and points so that `load_reconstruction` reads the same numbers again.
+
+    Parameters
+    ----------
+    path : str or path
+        The file, ``.npz``.
+    reconstruction : Reconstruction
+        What to write.
+
+    Raises
+    ------
+    ArgumentError
+        If the suffix is another one.
+    OSError
+        If the file cannot be written.
+    """
+    check_suffix(path, ".npz")
+    with writing(path) as file:
+        np.savez_compressed(file, P=reconstruction.P, Q=reconstruction.Q)
+
+
+def arrays_of(tracks: Tracks) -> dict[str, Any]:
+    """Return the arrays that stand for tracks in NPZ; weights only where they are not all one."""
+    weights = {"weights": tracks.weights} if (tracks.weights != 1.0).any() else {}
+    return {"view": tracks.view, "point": tracks.point, "xy": tracks.xy, **weights}
+
+
+def _form(path: PathLike) -> str:
+    """Return the suffix that chooses the form of a file."""
+    name = Path(path).name.lower()
+    for suffix in _SUFFIXES:
+        if name.endswith(suffix) and name != suffix:
+            return suffix
+    raise ArgumentError("path", f"is {str(path)!r}", f"a name ending in {listed(_SUFFIXES)}")
+
+
+def _read(path: Path, with_start: bool) -> dict[str, Any]:
+    """Read whatever a file holds."""
+    form = _form(path)
+    with path.open("rb") as file:
+        if form == ".npz":
+            start = ("P", "Q", "X") if with_start else ()
+            optional = ("weights", "clean", "n_views", "n_points", *start)
+            return dict(read_npz(path, file, [_TRACKS, ("P", "Q"), ("P", "X")], optional))
+        if form == ".csv":
+            columns = read_text(path, file, _COLUMNS, "clean")
+            found = {"view": columns["view"], "point": columns["point"]}
+            found["xy"] = np.column_stack([columns["x"], columns["y"]])
+            found |= {"weights": columns["weight"]} if "weight" in columns else {}
+            return found | ({"clean_rows": columns["clean"]} if "clean" in columns else {})
+        with _decompressing(file, form) as stream:
+            return read_bal(path, stream)
+
+
+def _observations(path: Path, found: dict[str, Any]) -> tuple[Any, Any, Any]:
+    """Check what must hold before indices are used as sizes of arrays."""
+    view, point, xy = (found[name] for name in _TRACKS)
+    for name, index in (("view", view), ("point", point)):
+        if index.ndim != 1 or index.dtype.kind not in "iu" or len(index) != len(view):
+            reason = f"{name} has type {index.dtype}, shape {index.shape}; needed: integers (N,)"
+            raise FileFormatError(path, reason)
+        bad = np.flatnonzero((index < 0) | (index >= MAX_MATCHES))
+        if len(bad):
+            reason = f"{name} is {index[bad[0]]} in row {bad[0]}, needed: 0 to {MAX_MATCHES - 1}"
+            raise FileFormatError(path, reason)
+    if xy.shape != (len(view), 2) or xy.dtype.kind not in "iuf":
+        reason = f"xy has type {xy.dtype}, shape {xy.shape}; needed: numbers ({len(view)}, 2)"
+        raise FileFormatError(path, reason)
+    return view, point, xy
+
+
+def _kept(
+    path: Path,
+    found: dict[str, Any],
+    view: Indices,
+    point: Indices,
+    clean: bool,
+    views: Iterable[int] | None,
+) -> NDArray[np.bool_] | None:
+    """Return which observations are asked for; None for all of them."""
+    if not clean and views is None:
+        return None
+    keep = np.ones(len(view), dtype=np.bool_)
+    if views is not None:
+        keep &= np.isin(view, list(views))
+    if clean:
+        keep &= _clean_rows(path, found, point)
+    if not keep.any():
+        raise FileFormatError(path, "holds no observation of those asked for")
+    return keep
+
+
+def _clean_rows(path: Path, found: dict[str, Any], point: Indices) -> NDArray[np.bool_]:
+    """Return which observations are marked as clean."""
+    if "clean_rows" in found:
+        return np.asarray(found["clean_rows"])
+    if "clean" not in found:
+        raise FileFormatError(path, "marks nothing as clean: it has no clean column or array")
+    marks = found["clean"]
+    if marks.ndim != 1 or marks.dtype.kind not in "biu" or len(marks) <= point.max(initial=-1):
+        reason = f"clean has type {marks.dtype}, shape {marks.shape}; needed: one mark a point"
+        raise FileFormatError(path, reason)
+    return np.asarray(marks[point] != 0)
+
+
+def _reconstruction(path: Path, found: dict[str, Any]) -> Reconstruction | None:
+    """Return cameras and points, where there are both."""
+    Q = found.get("Q", found.get("X"))
+    if "P" not in found or Q is None:
+        return None
+    if Q.ndim == 2 and Q.shape[1] == 3:
+        Q = np.column_stack([Q, np.ones(len(Q))])
+    try:
+        return Reconstruction(found["P"].astype(np.float64), Q.astype(np.float64))
+    except ArgumentError as error:
+        raise FileFormatError(path, str(error)) from None
+
+
+def _count(path: Path, name: str, found: dict[str, Any]) -> int | None:
+    """Check a number of views or points."""
+    if name not in found:
+        return None
+    count = found[name]
+    if count.shape != () or count.dtype.kind not in "iu" or not 0 < count <= MAX_MATCHES:
+        raise FileFormatError(path, f"{name} is no number from 1 to {MAX_MATCHES}")
+    return int(count)
+
+
+def _write_csv(file: IO[bytes], tracks: Tracks) -> None:
+    arrays = arrays_of(tracks)
+    head = ["view", "point", "x", "y", *(["weight"] if "weights" in arrays else [])]
+    columns = [tracks.view, tracks.point, *tracks.xy.T]
+    columns += [arrays["weights"]] if "weights" in arrays else []
+    file.write((",".join(head) + "\n").encode())
+    for row in zip(*(column.tolist() for column in columns), strict=True):
+        file.write((",".join(map(repr, row)) + "\n").encode())
+
+
+def _decompressing(file: IO[bytes], form: str) -> AbstractContextManager[Any]:
+    if form == ".txt":
+        return nullcontext(file)
+    return gzip.GzipFile("", "rb", fileobj=file) if form.endswith("gz") else bz2.BZ2File(file)
+
+
+def _compressing(file: IO[bytes], form: str) -> AbstractContextManager[Any]:
+    if form == ".txt":
+        return nullcontext(file)
+    # No date in the file: the same content gives the same bytes.
+    if form.endswith("gz"):
+        return gzip.GzipFile("", "wb", 9, file, 0.0)
+    return bz2.BZ2File(file, "wb")

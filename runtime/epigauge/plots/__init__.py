@@ -1,0 +1,10 @@
+"""Pictures of results, by Matplotlib without its global state.
+
+Matplotlib is imported only when a picture is made: ``pip install 'epigauge[plot]'``.
+"""
+
+from epigauge.plots._style import save_figure
+from epigauge.plots.many_views import plot_bundle, plot_comparison
+from epigauge.plots.two_views import plot_refinement
+
+__all__ = ["plot_bundle", "plot_comparison", "plot_refinement", "save_figure"]

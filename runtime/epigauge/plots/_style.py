@@ -1,0 +1,103 @@
+"""The common look of the pictures, and how they are written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from epigauge.errors import MissingPackageError
+from epigauge.io._common import PathLike, check_suffix
+from epigauge.io.output import writing
+from epigauge.lm import Row
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+GREY, BLUE, RED = "0.45", "#2a6f97", "#c1121f"
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of a size in inches, or say how to get Matplotlib."""
+    try:
+        from matplotlib.figure import Figure
+        from matplotlib.layout_engine import ConstrainedLayoutEngine
+    except ImportError:
+        raise MissingPackageError("matplotlib", "plot") from None
+    layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.1, hspace=0.04)
+    return Figure(figsize=(width, height), dpi=110, layout=layout)
+
+
+def heading(figure: Figure, text: str, failure: str = "") -> None:
+    """Write over the picture what was done and, in red, why that did not converge."""
+    text += f"  (not converged: {failure})" if failure else ""
+    figure.suptitle(text, x=0.01, ha="left", fontsize=13, color=RED if failure else "black")
+
+
+def save_figure(figure: Figure, path: PathLike) -> None:
+    """Write a picture as PNG or SVG; the same picture gives the same bytes.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        The picture.
+    path : str or path
+        The file; ``.png`` or ``.svg`` chooses the form.
+
+    Raises
+    ------
+    ArgumentError
+        If the suffix is neither of these.
+    OSError
+        If the file cannot be written.
+    """
+    suffix = check_suffix(path, ".png", ".svg")
+    from matplotlib import rc_context
+
+    undated = {"Software": None} if suffix == ".png" else {"Date": None, "Creator": None}
+    with writing(path) as file, rc_context({"svg.hashsalt": "epigauge"}):
+        figure.savefig(file, format=suffix[1:], metadata=undated)
+
+
+def draw_history(axes: Axes, history: Sequence[Row]) -> None:
+    """Draw the cost of each evaluation, less the lowest, accepted and rejected steps apart."""
+    from matplotlib.ticker import MaxNLocator
+
+    cost = np.array([row.cost for row in history], dtype=np.float64)
+    accepted = np.array([row.accepted for row in history], dtype=np.bool_)
+    accepted[:1] = True  # the start
+    shown = np.isfinite(cost)
+    lowest = float(cost[accepted & shown].min(initial=np.inf))
+    above = np.where(shown, cost - lowest, np.nan)
+    positive = above[above > 0.0]
+    floor = float(positive.min()) / 4.0 if len(positive) else 1.0
+    at = np.arange(1, len(cost) + 1)
+    drawn = np.maximum(above, floor)
+    axes.plot(at[accepted], drawn[accepted], "-", color=BLUE, lw=1.4, zorder=2)
+    higher = accepted & (above > 0.0)
+    style = {"ls": "", "color": BLUE, "ms": 6}
+    axes.plot(at[higher], drawn[higher], marker="o", label="accepted", **style)  # type: ignore[arg-type]
+    last = accepted & ~(above > 0.0)
+    label = f"lowest: {lowest:.6g} px\N{SUPERSCRIPT TWO}"
+    axes.plot(at[last], drawn[last], marker="v", label=label, **style | {"ms": 8})  # type: ignore[arg-type]
+    rejected = ~accepted & shown
+    if rejected.any():
+        cross = {"ls": "", "marker": "x", "color": RED, "ms": 7, "mew": 1.8}
+        axes.plot(at[rejected], drawn[rejected], label="rejected", **cross)  # type: ignore[arg-type]
+    axes.set_yscale("log")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set(xlabel="evaluation", ylabel="cost above the lowest (px\N{SUPERSCRIPT TWO})")
+    finish(axes, "Convergence")
+
+
+def finish(axes: Axes, title: str) -> None:
+    """Give a panel of curves the common look."""
+    axes.set_title(title, loc="left", fontsize=11)
+    axes.grid(color="0.9", lw=0.7)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color("0.6")
+    axes.tick_params(labelsize=8, color=GREY)
+    axes.legend(fontsize=9, frameon=False)

@@ -1,0 +1,1 @@
+"""Experiments of the papers, repeated: tables, figures, and each claim checked."""

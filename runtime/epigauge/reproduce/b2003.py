@@ -1,0 +1,34 @@
+"""All experiments of Bartoli 2003, and some that the paper does not have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from epigauge.reproduce import gauge_experiments
+from epigauge.reproduce.gauge_runs import GaugeStudy
+from epigauge.reproduce.report import Section
+
+__all__ = ["EXPERIMENTS", "TITLE", "introduction"]
+
+#: The experiments by name, in the order of the report.
+EXPERIMENTS: dict[str, Callable[[GaugeStudy], Section]] = {
+    "flatness": gauge_experiments.flatness,
+    "iterations": gauge_experiments.iterations,
+    "table2": gauge_experiments.hotel,
+    "bases": gauge_experiments.bases,
+    "defects": gauge_experiments.defects,
+    "starts": gauge_experiments.starts,
+}
+
+TITLE = "Bartoli 2003, reproduced"
+
+
+def introduction(study: GaugeStudy) -> list[str]:
+    """Return the paragraphs above the claims."""
+    return [
+        'A. Bartoli, "Towards gauge invariant bundle adjustment: a solution based on gauge '
+        'dependent damping", ICCV 2003, section 7, with the program that ships with this package: '
+        f"epigauge reproduce b2003 --trials {study.trials} --seed {study.seed}. "
+        "LEVENBERG and MARQUARDT leave everything free and damp by lambda I and lambda diag(N); "
+        "COVARIANT is ours: covariant damping and re-triangulated points.",
+    ]

@@ -1,0 +1,221 @@
+"""What the experiments on gauges share: scenes, runs by method, random bases, defects of a step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge import kernels
+from epigauge.multi_view import dampings
+from epigauge.multi_view.adjust import BundleResult, bundle_adjust
+from epigauge.multi_view.gauge import Gauge, Transformation, identity, normalized
+from epigauge.multi_view.initialize import Frame, initialize
+from epigauge.multi_view.problem import BundleProblem
+from epigauge.multi_view.system import Layout
+from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.reproduce.common import Track, tracked
+from epigauge.scenes import multi_view_scene
+from epigauge.two_view.losses import Loss
+
+__all__ = [
+    "LABELS",
+    "SETS",
+    "STEPS",
+    "GaugeStudy",
+    "Step",
+    "moved",
+    "random_transformation",
+    "step_defect",
+]
+
+Array = NDArray[np.float64]
+
+#: Methods in the order of tables, with their names in the paper.
+LABELS = {
+    "free": "FREE",
+    "levenberg": "LEVENBERG",
+    "marquardt": "MARQUARDT",
+    "hartley": "HARTLEY",
+    "bartoli": "BARTOLI",
+    "faugeras": "FAUGERAS",
+    "mclauchlan": "MCLAUCHLAN",
+    "kanatani": "KANATANI",
+    "gauge_invariant": "GAUGE_INVARIANT",
+    "gauge_invariant_factor": "GAUGE_INVARIANT, rank one",
+    "covariant": "COVARIANT",
+}
+
+#: Measured sequences with the lowest RMS known, in pixels per coordinate.
+SETS = {
+    "corridor": 0.272462,
+    "house": 0.441660,
+    "library": 0.172830,
+    "merton_1": 0.118450,
+    "dinosaur_trimmed": 1.114493,
+}
+
+_FTOL, _MAX_ITER = 1e-8, 100
+
+
+@dataclass
+class GaugeStudy:
+    """What all experiments are run with; runs are made once and remembered.
+
+    Parameters
+    ----------
+    trials : int
+        Trials a configuration; trial k has the seed `seed` + k.
+    seed : int
+        First seed.
+    data : path, optional
+        Directory of measured data, or None where there is none.
+    track : callable
+        Wraps the items of a loop, given its label, to show progress.
+    """
+
+    trials: int = 10
+    seed: int = 0
+    data: Path | None = None
+    track: Track = tracked
+    _starts: dict[tuple[float, int], tuple[Tracks, Reconstruction]] = field(default_factory=dict)
+    _runs: dict[tuple[float, int, str], BundleResult] = field(default_factory=dict)
+
+    def start(self, flatness: float, trial: int) -> tuple[Tracks, Reconstruction]:
+        """Return scene and initial reconstruction of a trial."""
+        key = (flatness, trial)
+        if key not in self._starts:
+            scene = multi_view_scene(flatness, seed=self.seed + trial)
+            self._starts[key] = scene.tracks, initialize(scene.tracks)
+        return self._starts[key]
+
+    def run(self, flatness: float, trial: int, method: str) -> BundleResult:
+        """Run a method on a trial."""
+        key = (flatness, trial, method)
+        if key not in self._runs:
+            self._runs[key] = self.adjust(*self.start(flatness, trial), method)
+        return self._runs[key]
+
+    def adjust(self, tracks: Tracks, start: Reconstruction, method: str) -> BundleResult:
+        """Run a method with the stopping rule of all experiments."""
+        return bundle_adjust(tracks, start, method=method, ftol=_FTOL, max_iter=_MAX_ITER)
+
+    def measured(self, name: str, step: int = 1) -> Tracks | None:
+        """Return a measured sequence, its clean tracks in every `step`-th view, or None."""
+        path = None if self.data is None else self.data / name / "tracks.npz"
+        if path is None or not path.is_file():
+            return None
+        with np.load(path, allow_pickle=False) as file:
+            view, point, xy = file["view"], file["point"], file["xy"]
+            keep = view % step == 0
+            if "clean" in file:
+                keep &= file["clean"][point]
+        return Tracks.pruned(view[keep], point[keep], xy[keep])[0]
+
+
+def random_transformation(
+    random: np.random.Generator, condition: float, n: int, m: int
+) -> Transformation:
+    """Return a random change of basis with random scales.
+
+    Parameters
+    ----------
+    random : numpy.random.Generator
+        Source.
+    condition : float
+        Ratio of the largest to the smallest singular value of T; with 1, T is orthonormal.
+    n, m : int
+        Numbers of cameras and points.
+
+    Returns
+    -------
+    Transformation
+        Scales are log-normal of unit deviation.
+    """
+    U, V = (np.linalg.qr(random.normal(size=(4, 4)))[0] for _ in range(2))
+    T = (U * np.geomspace(1.0, condition, 4)) @ V
+    return Transformation(T, np.exp(random.normal(size=n)), np.exp(random.normal(size=m)))
+
+
+def moved(start: Reconstruction, there: Transformation) -> Reconstruction:
+    """Return a reconstruction in another basis."""
+    return Reconstruction(*there.apply(start.P, start.Q))
+
+
+@dataclass(frozen=True)
+class Step:
+    """A damping, and where its steps are made.
+
+    Attributes
+    ----------
+    label : str
+        Name in tables.
+    damping : object
+        Turns a system and lambda into a step.
+    gauge : Gauge
+        Basis that the step is computed in before it is moved back.
+    """
+
+    label: str
+    damping: Any
+    gauge: Gauge = field(default_factory=identity)
+
+
+#: The dampings whose single steps are compared.
+STEPS = (
+    Step("lambda I", dampings.Levenberg()),
+    Step("lambda diag N", dampings.Marquardt()),
+    Step("pseudo-inverse", dampings.PseudoInverse()),
+    Step("Table 1, |R^T R|", dampings.GaugeInvariant("product")),
+    Step("Table 1, |vec R|", dampings.GaugeInvariant("factor")),
+    Step("covariant, in the basis given", dampings.Covariant()),
+    Step("covariant, in the normalised basis", dampings.Covariant(), normalized()),
+)
+
+
+def step_defect(tracks: Tracks, start: Reconstruction, step: Step, there: Transformation) -> float:
+    """Return |delta' - T~ delta| / |delta'| of one step (B03 eq. 7), lambda being the same.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Observations.
+    start : Reconstruction
+        Where the step is made from.
+    step : Step
+        How.
+    there : Transformation
+        T~.
+
+    Returns
+    -------
+    float
+        Zero for a gauge invariant iteration.
+    """
+    frame = Frame.of(tracks)
+    layout = Layout(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+    weights = np.ones(len(tracks))
+    problem = BundleProblem(kernels.table(), layout, frame.conditioned(tracks), weights, Loss())
+    P, Q = frame.cameras_in(start.P), start.Q
+    lam = step.damping.start(problem.linearize(problem.evaluate((P, Q))))
+    expected = _blocks_times(there, _made(problem, P, Q, step, lam))
+    found = _made(problem, *there.apply(P, Q), step, lam)
+    return float(np.linalg.norm(found - expected) / np.linalg.norm(found))
+
+
+def _made(problem: BundleProblem, P: Array, Q: Array, step: Step, lam: float) -> Array:
+    """Return a step as one vector, made in the gauge of `step` and moved back."""
+    home = step.gauge.transformation(P, Q)
+    system = problem.linearize(problem.evaluate(home.apply(P, Q)))
+    return _blocks_times(home.inverse(), step.damping.step(system, lam))
+
+
+def _blocks_times(there: Transformation, vector: Array) -> Array:
+    """Return T~ times a vector of all parameters."""
+    cameras, points = there.blocks()
+    x, y = vector[: 12 * len(cameras)].reshape(-1, 12), vector[12 * len(cameras) :].reshape(-1, 4)
+    parts = np.einsum("nij,nj->ni", cameras, x), np.einsum("nij,nj->ni", points, y)
+    return np.concatenate([part.ravel() for part in parts])

@@ -1,0 +1,213 @@
+"""The epipolar geometry that most matches agree on, among matches with gross errors.
+
+The exact distances of right matches are normal with an unknown standard deviation, those of wrong
+ones uniform over the image, and the share of right ones is unknown too: the likelihood of all
+matches under this mixture says how good a geometry is, without any threshold. It has many local
+maxima; they are climbed from starts that subsets of the right matches give.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge import lm
+from epigauge.kernels import Table
+from epigauge.linear import Levenberg
+from epigauge.two_view.conditioning import RMS
+from epigauge.two_view.criteria import Reprojection
+from epigauge.two_view.eliminated import EliminatedProblem
+from epigauge.two_view.losses import Mixture
+from epigauge.two_view.parameterizations import Block
+
+__all__ = ["Agreement", "Consensus"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: Range of a uniform coordinate with the RMS of conditioned ones.
+_RANGE = 12.0**0.5 * RMS
+
+#: Standard deviation of the noise, conditioned, below which distances are rounding.
+_FLOOR = 1e-12
+
+#: The share of right matches stays inside these.
+_SHARES = (0.02, 0.999)
+
+#: Climbing ends when the logarithm of the likelihood grows by less; one is a standard deviation.
+_CLIMBED = 1e-3
+_CLIMBS = 20
+
+#: Subsets drawn a round, by their size, how many of the best are climbed, and rounds at most.
+_SIZES = (8, 12, 20, 40)
+_SUBSETS = 75
+_CLIMBERS = 5
+_ROUNDS = 5
+
+#: Subsets are drawn from, and judged by, about this many matches.
+_FEW = 2000
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """A geometry and how well the matches agree with it, in conditioned coordinates.
+
+    Attributes
+    ----------
+    F : ndarray, shape (3, 3)
+        Fundamental matrix.
+    signed : ndarray, shape (m,)
+        Exact distances.
+    oriented : ndarray of bool, shape (m,)
+        Whether a match can lie in front of both cameras, as most do.
+    sigma : float
+        Standard deviation of the distances of right matches.
+    share : float
+        Share of right matches.
+    score : float
+        Logarithm of the likelihood, less what any seven matches gain by fitting exactly.
+    """
+
+    F: Array
+    signed: Array
+    oriented: Mask
+    sigma: float
+    share: float
+    score: float
+
+    @property
+    def mixture(self) -> Mixture:
+        """Return the density of the distances."""
+        return Mixture.of(self.sigma, self.share, _RANGE)
+
+    def inliers(self, limit: float) -> Mask:
+        """Return which matches are oriented and within a distance."""
+        return np.asarray(self.oriented & (np.abs(self.signed) <= limit))
+
+
+class Consensus:
+    """Search for the best agreement of given matches.
+
+    Parameters
+    ----------
+    kernels : Table
+        Backend.
+    q1, q2 : ndarray, shape (2, m)
+        Conditioned matches.
+    """
+
+    def __init__(self, kernels: Table, q1: Array, q2: Array) -> None:
+        self.criterion = Reprojection(kernels, q1, q2)
+        self.block = Block(kernels)
+        ones = np.ones((1, q1.shape[1]))
+        self.h1, self.h2 = np.vstack([q1, ones]), np.vstack([q2, ones])
+        self.few = slice(None, None, -(-q1.shape[1] // _FEW))
+        self.products = (self.h2[:, None, self.few] * self.h1[None, :, self.few]).reshape(9, -1)
+
+    def judge(self, F: Array, sigma: float, share: float = 0.5) -> Agreement:
+        """Return the agreement with F, sigma and share being fitted from the values given."""
+        signed = self.criterion.evaluate(F).signed
+        oriented = self.oriented(F)
+        squared = signed**2
+        best = None
+        while True:
+            mixture = Mixture.of(sigma, share, _RANGE)
+            wrong = np.log((1.0 - share) / _RANGE)
+            logs = np.where(oriented, mixture.logarithm(squared), wrong)
+            score = float(np.sum(logs)) - 7.0 * float(np.log(_RANGE / sigma))
+            if best is not None and score <= best.score + _CLIMBED:
+                return best
+            best = Agreement(F, signed, oriented, sigma, share, score)
+            right = np.where(oriented, mixture(squared)[1], 0.0)
+            count = float(np.sum(right))
+            share = float(np.clip(count / len(squared), *_SHARES))
+            # The seven parameters of F absorb seven squares of the noise
+            variance = np.sum(right * squared) / max(count - 7.0, 1.0)
+            sigma = max(float(np.sqrt(variance)), _FLOOR)
+
+    def climb(self, start: Agreement) -> Agreement:
+        """Maximise the likelihood over F, sigma and share in turns."""
+        best = start
+        for _ in range(_CLIMBS):
+            problem = EliminatedProblem(
+                self.criterion,
+                self.block,
+                best.oriented.astype(np.float64),
+                best.mixture,
+                exact=True,
+            )
+            stopping = lm.Stopping(ftol=1e-6, max_iter=10)
+            found = lm.minimize(
+                problem, self.block.start(best.F), Levenberg(), lm.Classic(), stopping
+            )
+            trial = self.judge(found.state.F, best.sigma, best.share)
+            if trial.score <= best.score + _CLIMBED:
+                break
+            best = trial
+        return best
+
+    def search(self, starts: Iterable[Agreement], rng: np.random.Generator) -> Agreement:
+        """Climb from the starts and from what subsets of the right matches lead to."""
+        best = max(map(self.climb, starts), key=_score)
+        for _ in range(_ROUNDS):
+            pool = np.flatnonzero(best.inliers(3.0 * best.sigma)[self.few])
+            if len(pool) <= _SIZES[0]:
+                break
+            starts = self.promising(self.subset_fits(pool, rng), best)
+            climbed = [self.climb(self.judge(F, best.sigma, best.share)) for F in starts]
+            highest = max(climbed, key=_score)
+            if highest.score <= best.score + _CLIMBED:
+                break
+            best = highest
+        return best
+
+    def subset_fits(self, pool: NDArray[np.intp], rng: np.random.Generator) -> Array:
+        """Return 8-point estimates from random subsets of a pool of the few, shape (k, 3, 3)."""
+        weights = np.zeros((_SUBSETS * len(_SIZES), self.products.shape[1]))
+        for k, size in enumerate(_SIZES):
+            order = np.argsort(rng.random((_SUBSETS, len(pool))), axis=1)[:, :size]
+            rows = weights[k * _SUBSETS : (k + 1) * _SUBSETS]
+            np.put_along_axis(rows, pool[order], 1.0, axis=1)
+        return self.linear_fits(weights)
+
+    def linear_fits(self, weights: Array) -> Array:
+        """Return the 8-point estimate for each row of weights."""
+        outer = (self.products[:, None] * self.products[None]).reshape(81, -1)
+        N = (weights @ outer.T).reshape(-1, 9, 9)
+        U, values, Vt = np.linalg.svd(np.linalg.eigh(N)[1][:, :, 0].reshape(-1, 3, 3))
+        return np.asarray((U[:, :, :2] * values[:, None, :2]) @ Vt[:, :2])
+
+    def promising(self, F: Array, best: Agreement) -> Array:
+        """Return the few of many geometries that lead highest, after refits to their inliers."""
+        mixture = best.mixture
+        for keep in (len(F) // 4, len(F) // 10, _CLIMBERS):
+            squared = self.sampson(F)
+            order = np.argsort(-np.sum(mixture.logarithm(squared), axis=1))[:keep]
+            F = F[order]
+            if keep > _CLIMBERS:
+                F = self.linear_fits(mixture(squared[order])[1])
+        return F
+
+    def sampson(self, F: Array) -> Array:
+        """Return squared Sampson distances of the few matches to many F, shape (k, few)."""
+        line2 = F.reshape(-1, 3) @ self.h1[:, self.few]
+        line1 = np.swapaxes(F, 1, 2).reshape(-1, 3) @ self.h2[:, self.few]
+        line1, line2 = line1.reshape(len(F), 3, -1), line2.reshape(len(F), 3, -1)
+        C = F.reshape(-1, 9) @ self.products
+        length2 = np.sum(line1[:, :2] ** 2, axis=1) + np.sum(line2[:, :2] ** 2, axis=1)
+        return np.asarray(C**2 / np.maximum(length2, 1e-300))
+
+    def oriented(self, F: Array) -> Mask:
+        """Return which matches satisfy the oriented epipolar constraint with the sign most have."""
+        epipole = np.linalg.svd(F)[0][:, 2]
+        line = F @ self.h1
+        # (e' x q') . (F q)
+        sign = np.sum(np.cross(epipole, self.h2, axisb=0, axisc=0) * line, axis=0)
+        return np.asarray(sign > 0.0 if np.sum(np.sign(sign)) >= 0.0 else sign < 0.0)
+
+
+def _score(agreement: Agreement) -> float:
+    return agreement.score

@@ -1,0 +1,248 @@
+"""From raw matches with gross errors to the maximum-likelihood fundamental matrix."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import itertools
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge import kernels
+from epigauge._arguments import as_choice, as_count, as_matches, as_positive
+from epigauge.errors import ArgumentError, MissingPackageError
+from epigauge.two_view.conditioning import RMS, condition
+from epigauge.two_view.consensus import Agreement, Consensus
+from epigauge.two_view.initial import fundamental_8point
+from epigauge.two_view.losses import robust_scale
+from epigauge.two_view.refine import refine_fundamental
+from epigauge.two_view.result import FundamentalResult
+
+__all__ = ["RobustResult", "estimate_fundamental"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: Front ends work in coordinates of this RMS, as an image has: OpenCV computes in float32.
+_PIXELS = 250.0 / RMS
+
+#: Thresholds that front ends are run with where none is given, in conditioned coordinates whose
+#: range is about 7: from a twentieth of a per cent of the image to 3 %.
+_THRESHOLDS = (0.0035, 0.02, 0.2)
+
+#: Distance of an inlier in standard deviations of the noise, at most.
+_DEVIATIONS = 3.0
+
+_ROUNDS = 20
+
+#: Options of `refine_fundamental` with one entry a match.
+_PER_MATCH = {"weights": 1, "covariance1": 3, "covariance2": 3}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustResult(FundamentalResult):
+    """A fundamental matrix estimated from raw matches.
+
+    What `FundamentalResult` says of matches (points, fun, jac) is for the matches that were used.
+
+    Attributes
+    ----------
+    inlier : ndarray of bool, shape (m,)
+        Which of all matches agree with F, duplicates included.
+    used : ndarray of int, shape (n,)
+        Rows of the matches that F was fitted to: the inliers, each of several equal ones once.
+    threshold_px : float
+        Largest distance of an inlier.
+    rounds : int
+        How many times F was refined before the inliers stood still.
+    start : str
+        Front end whose start agreed best with the matches: "poselib", "opencv", or "8point" where
+        it found nothing.
+    """
+
+    inlier: Mask = field(repr=False)
+    used: NDArray[np.intp] = field(repr=False)
+    threshold_px: float
+    rounds: int
+    start: str
+
+
+def estimate_fundamental(
+    x1: ArrayLike,
+    x2: ArrayLike,
+    *,
+    robust: str = "auto",
+    threshold_px: float | str = "auto",
+    seed: int = 0,
+    **options: Any,
+) -> RobustResult:
+    """Find the fundamental matrix of raw matches, gross errors among them.
+
+    A front end (PoseLib or OpenCV) gives starts. From there the likelihood of all matches is
+    maximised over F, the noise and the share of right matches. `refine_fundamental` then fits
+    the inliers, those whose exact distance is within a threshold, until they stand still.
+
+    Parameters
+    ----------
+    x1, x2 : array_like, shape (m, 2)
+        At least eight different matches in pixels; exact duplicates count once.
+    robust : {"auto", "poselib", "opencv"}
+        The front end: PoseLib's LO-RANSAC or OpenCV's USAC_MAGSAC. "auto" starts from both, where
+        both are installed.
+    threshold_px : float or "auto"
+        Largest distance of an inlier. "auto" takes three standard deviations of the noise, from the
+        median distance of the inliers, but no more than the distance at which a match is as likely
+        right as wrong.
+    seed : int
+        Of everything random: one seed, one answer.
+    **options
+        Of `refine_fundamental`, but for `F0`. `weights` and covariances are those of all matches;
+        they count in the refinement. `noise_px` is by default estimated.
+
+    Returns
+    -------
+    RobustResult
+        As `refine_fundamental`, with the inliers and how they were found.
+
+    Raises
+    ------
+    MissingPackageError
+        If the front end, or with "auto" any, is not installed.
+    ArgumentError
+        On bad arguments, and if fewer than eight matches agree on an epipolar geometry.
+
+    Notes
+    -----
+    The density of the distance d of a match is taken as p N(d; 0, sigma^2) + (1 - p) / range; the
+    range is that of the coordinates. The likelihood is climbed from the start and from 8-point
+    estimates of random subsets of the inliers, until that finds nothing higher. Matches that
+    violate the oriented epipolar constraint count as wrong.
+    """
+    x1, x2 = as_matches(x1, x2, general_position=True)
+    names = _front_ends(robust)
+    seed = as_count("seed", seed, at_least=0)
+    threshold = None if threshold_px == "auto" else as_positive("threshold_px", threshold_px)
+    if "F0" in options:
+        raise ArgumentError("F0", "is given", "refine_fundamental, which starts from it")
+
+    _, first, copies = np.unique(
+        np.column_stack([x1, x2]), axis=0, return_index=True, return_inverse=True
+    )
+    if len(first) < 8:
+        raise ArgumentError("x1, x2", f"hold {len(first)} different matches", "at least 8")
+    # In the caller's order, so that the draws of a front end do not depend on the values
+    order = np.argsort(first)
+    rows, copies = first[order], np.argsort(order)[copies.ravel()]
+    y1, y2 = x1[rows], x2[rows]
+
+    frame = condition(y1, y2)
+    consensus = Consensus(kernels.table(options.get("backend")), *frame.forward(y1, y2))
+    thresholds = _THRESHOLDS if threshold is None else (threshold / frame.scale,)
+    starts = _starts(consensus, names, thresholds, seed)
+    name = max(starts, key=lambda start: start[1].score)[0]
+    agreement = consensus.search((a for _, a in starts), np.random.default_rng(seed))
+
+    options.setdefault("noise_px", None)
+    limit = agreement.mixture.even if threshold is None else threshold / frame.scale
+    inlier = agreement.inliers(limit)
+    fitted: set[bytes] = set()
+    while inlier.tobytes() not in fitted and len(fitted) < _ROUNDS:
+        if np.count_nonzero(inlier) < 8:
+            raise ArgumentError(
+                "x1, x2", "agree on no epipolar geometry", "at least 8 matches that do"
+            )
+        fitted.add(inlier.tobytes())
+        used, limit_px = inlier, limit * frame.scale
+        start = frame.to_pixels(agreement.F)
+        chosen = _of_matches(options, len(x1), rows[used])
+        refined = refine_fundamental(y1[used], y2[used], start, **chosen)
+        F = frame.from_pixels(refined.F)
+        agreement = consensus.judge(F, agreement.sigma, agreement.share)
+        if threshold is None:
+            sigma = robust_scale(agreement.signed[used])
+            limit = min(limit, max(_DEVIATIONS * sigma, 1e-9))
+        inlier = agreement.inliers(limit)
+    return RobustResult(
+        **{entry.name: getattr(refined, entry.name) for entry in fields(refined)},
+        inlier=used[copies],
+        used=rows[used],
+        threshold_px=limit_px,
+        rounds=len(fitted),
+        start=name,
+    )
+
+
+def _of_matches(options: dict[str, Any], m: int, rows: NDArray[np.intp]) -> dict[str, Any]:
+    """Return the options with those that have one entry a match restricted to some."""
+    chosen = dict(options)
+    for name, dimensions in _PER_MATCH.items():
+        value = np.asarray(options.get(name))
+        if value.ndim == dimensions and len(value) == m:
+            chosen[name] = value[rows]
+    return chosen
+
+
+def _starts(
+    consensus: Consensus, names: Iterable[str], thresholds: Iterable[float], seed: int
+) -> list[tuple[str, Agreement]]:
+    """Return what the front ends find, run at all thresholds."""
+    few = consensus.few
+    x1, x2 = (np.ascontiguousarray(h[:2, few].T) * _PIXELS for h in (consensus.h1, consensus.h2))
+    back = np.diag([_PIXELS, _PIXELS, 1.0])
+    found = []
+    for name, threshold in itertools.product(names, thresholds):
+        F = _FRONT_ENDS[name](x1, x2, threshold * _PIXELS, seed)
+        if F is not None and np.isfinite(F).all() and np.linalg.matrix_rank(F) >= 2:
+            found.append((name, consensus.judge(back @ F @ back, threshold / _DEVIATIONS)))
+    if not found:
+        F = back @ fundamental_8point(x1, x2) @ back
+        found.append(("8point", consensus.judge(F, max(thresholds) / _DEVIATIONS)))
+    return found
+
+
+def _front_ends(robust: str) -> tuple[str, ...]:
+    """Return the names of the front ends to use."""
+    as_choice("robust", robust, ("auto", *_FRONT_ENDS))
+    names = tuple(_FRONT_ENDS) if robust == "auto" else (robust,)
+    installed = tuple(n for n in names if importlib.util.find_spec(_MODULES[n]) is not None)
+    if not installed:
+        raise MissingPackageError(" or ".join(_PACKAGES[name] for name in names), "cv")
+    return installed
+
+
+def _poselib(x1: Array, x2: Array, threshold: float, seed: int) -> Array | None:
+    poselib = importlib.import_module("poselib")
+    options = {"max_epipolar_error": threshold, "seed": seed, "max_iterations": 10_000}
+    F, _ = poselib.estimate_fundamental(x1, x2, options, {})
+    return np.asarray(F, dtype=np.float64)
+
+
+def _opencv(x1: Array, x2: Array, threshold: float, seed: int) -> Array | None:
+    cv2 = importlib.import_module("cv2")
+    parameters = cv2.UsacParams()
+    parameters.threshold = threshold
+    parameters.confidence = 0.999
+    parameters.maxIterations = 10_000
+    parameters.randomGeneratorState = seed
+    parameters.sampler = cv2.SAMPLING_UNIFORM
+    parameters.score = cv2.SCORE_METHOD_MAGSAC
+    parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA
+    parameters.loIterations = 10
+    parameters.final_polisher = cv2.MAGSAC
+    try:
+        F, _ = cv2.findFundamentalMat(x1, x2, parameters)
+    except cv2.error:
+        return None
+    return None if F is None or F.shape != (3, 3) else np.asarray(F, dtype=np.float64)
+
+
+_MODULES = {"poselib": "poselib", "opencv": "cv2"}
+_PACKAGES = {"poselib": "poselib", "opencv": "opencv-python-headless"}
+_FRONT_ENDS: dict[str, Callable[[Array, Array, float, int], Array | None]] = {
+    "poselib": _poselib,
+    "opencv": _opencv,
+}

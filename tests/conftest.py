@@ -1,0 +1,52 @@
+"""Fixtures shared by all tests: where the real data lies."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+#: The image pairs of the data directory's folder ``pairs``.
+PAIRS = (
+    "adelaide_barrsmith",
+    "adelaide_bonhall",
+    "adelaide_elderhalla",
+    "adelaide_johnssona",
+    "adelaide_ladysymon",
+    "adelaide_library",
+    "adelaide_nese",
+    "adelaide_physics",
+    "adelaide_unionhouse",
+    "entry_p10_2_3",
+    "fountain_p11_0_4",
+    "fountain_p11_4_5",
+    "kitti_forward_1_5",
+    "kusvod2_booksh",
+    "kusvod2_box",
+    "kusvod2_castle",
+    "kusvod2_corr",
+    "kusvod2_head",
+    "kusvod2_kampa",
+    "kusvod2_rotunda",
+    "kusvod2_zoom",
+    "motorcycle_rectified",
+    "templeSR_1_2",
+    "templeSR_9_10",
+)
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Return $EPIGAUGE_DATA, or ``../shared/data`` beside the checkout; skip where neither is."""
+    checkout = Path(__file__).resolve().parents[1]
+    directory = Path(os.environ.get("EPIGAUGE_DATA", checkout.parent / "shared" / "data"))
+    if not (directory / "pairs").is_dir():
+        pytest.skip("no measured data: set EPIGAUGE_DATA to the directory that holds pairs/")
+    return directory
+
+
+@pytest.fixture(params=PAIRS)
+def pair(request: pytest.FixtureRequest, data_dir: Path) -> Path:
+    """NPZ file of one measured image pair; a test that asks for it runs once a pair."""
+    return data_dir / "pairs" / f"{request.param}.npz"

@@ -1,0 +1,447 @@
+"""Every generated Jacobian and Hessian against central differences, through the retraction.
+
+The tests name the kernels they check, and the last one fails when a kernel has a derivative that
+no test here has checked.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from epigauge import kernels
+from epigauge.kernels import SIGNATURES
+from laws import (
+    assert_jacobian,
+    central_differences,
+    distance,
+    factor_cases,
+    fundamental_cases,
+    matches,
+)
+
+# The back ends agree (test_backends.py): the fast one, where it is there.
+K = kernels.table("c" if kernels.available()["c"] is None else "numpy")
+UPPER = np.triu_indices(9)
+CASES = factor_cases()
+MATRICES = fundamental_cases()
+COUNT = 7
+# Near an epipole residuals change with F over a range of about 0.01, and the fifth derivative is
+# large. At this step truncation is below 1e-10 even there, and rounding, 1e-16 / STEP times the
+# condition of a foot point, below 1e-9.
+STEP, TOLERANCE = 2e-5, 1e-8
+
+
+def unpack(packed):
+    """Return the symmetric matrix of an upper triangle."""
+    matrix = np.zeros((9, 9))
+    matrix[UPPER] = packed
+    return matrix + np.triu(matrix, 1).T
+
+
+def second_differences(f, size):
+    """Differentiate `f` twice at zero."""
+    # Nested: rounding 1e-16 / h^2 and truncation h^4 are both about 1e-10 at this step.
+    zero, step = np.zeros(size), 5e-3
+
+    def first(a):
+        return central_differences(lambda b: f(a + b), zero, step)
+
+    return central_differences(first, zero, step)
+
+
+# ---------------------------------------------------------------- charts of F and P'
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_rotation_derivatives(case):
+    U, _, _ = CASES[case]
+    dU, d2U = K.rotation_derivatives(U)
+
+    def moved(theta):
+        return K.rotate_columns(U, theta)
+
+    assert_jacobian(moved, np.zeros(3), dU)
+    assert distance(d2U, second_differences(moved, 3)) <= 1e-8
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_fundamental_derivatives_through_the_retraction(case):
+    factors = CASES[case]
+    F, dF, d2F = K.fundamental_derivatives(*factors)
+    assert distance(F, K.fundamental_from_factors(*factors)) <= 1e-15
+
+    def moved(delta):
+        return K.fundamental_from_factors(*K.retract_factors(*factors, delta)).ravel()
+
+    assert_jacobian(moved, np.zeros(7), dF)
+    assert distance(d2F, second_differences(moved, 7)) <= 1e-8
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_canonical_camera_derivatives_through_the_retraction(case):
+    factors = CASES[case]
+    P2, A_perp = K.canonical_camera_derivatives(*factors)
+    assert distance(P2, K.canonical_camera(*factors)) <= 1e-15
+
+    def moved(delta):
+        return K.canonical_camera(*K.retract_factors(*factors, delta)).ravel()
+
+    assert_jacobian(moved, np.zeros(7), A_perp)
+
+
+def block_matrices():
+    """Return 2x2 matrices of unit norm: singular values different, equal, and one zero."""
+    general = np.array([[0.5, -0.3], [0.2, 0.7]])
+    equal = np.array([[0.6, -0.8], [0.8, 0.6]])
+    mirrored = np.array([[0.6, 0.8], [0.8, -0.6]])
+    single = np.array([[0.2, 0.4], [0.1, 0.2]])
+    return [M / np.linalg.norm(M) for M in (general, equal, mirrored, single)]
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("M", block_matrices(), ids=["general", "equal", "mirrored", "single"])
+def test_block_derivatives_through_the_retraction(case, M):
+    factors = (*CASES[case][:2], M)
+    F, dF, d2F = K.block_derivatives(*factors)
+    P2, dP2 = K.block_camera_derivatives(*factors)
+
+    def moved(delta):
+        return K.block_derivatives(*K.block_retract(*factors, delta))[0].ravel()
+
+    def moved_camera(delta):
+        return K.block_camera_derivatives(*K.block_retract(*factors, delta))[0].ravel()
+
+    assert distance(moved(np.zeros(7)), F.ravel()) <= 1e-15
+    assert distance(moved_camera(np.zeros(7)), P2.ravel()) <= 1e-15
+    assert_jacobian(moved, np.zeros(7), dF)
+    assert_jacobian(moved_camera, np.zeros(7), dP2)
+    assert distance(d2F, second_differences(moved, 7)) <= 1e-8
+
+
+@pytest.mark.parametrize("name", [name for name in SIGNATURES if name.startswith("maps_")])
+def test_maps_derivatives(name):
+    parameters = np.random.default_rng(int(name[-3:])).uniform(-1.0, 1.0, 7)
+    _, dF, d2F, _, dP2 = getattr(K, name)(parameters)
+    assert_jacobian(lambda p: getattr(K, name)(p)[0].ravel(), parameters, dF)
+    assert_jacobian(lambda p: getattr(K, name)(p)[1], parameters, d2F)
+    assert_jacobian(lambda p: getattr(K, name)(p)[3].ravel(), parameters, dP2)
+
+
+# ---------------------------------------------------------------- projections
+
+
+def cameras(rng):
+    """Return cameras and points: general, at infinity, and near the focal plane."""
+    P, Q = rng.standard_normal((3, 4)), rng.standard_normal(4)
+    infinite = np.append(rng.standard_normal(3), 0.0)
+    near = rng.standard_normal(4)
+    near[3] = (0.05 - P[2, :3] @ near[:3]) / P[2, 3]  # depth 0.05
+    return {"general": (P, Q), "at infinity": (P, infinite), "near the focal plane": (P, near)}
+
+
+@pytest.mark.parametrize("case", cameras(np.random.default_rng(0)))
+def test_projection_derivatives(case):
+    P, Q = cameras(np.random.default_rng(0))[case]
+    q_hat, J_P, J_Q, depth = K.project(P, Q)
+    h = P @ Q
+    np.testing.assert_allclose(q_hat, h[:2] / h[2], rtol=1e-13)
+    np.testing.assert_allclose(depth, h[2], rtol=1e-13)
+    # The steps change the depth by at most a thousandth of it.
+    step = 1e-3 * abs(float(depth)) / np.abs([*P.ravel(), *Q]).max()
+    assert_jacobian(lambda x: K.project(x, Q)[0], P, J_P.reshape(2, 3, 4), step=step)
+    assert_jacobian(lambda x: K.project(P, x)[0], Q, J_Q, step=step)
+
+
+@pytest.mark.parametrize("case", cameras(np.random.default_rng(0)))
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["in front", "behind"])
+def test_log_depth_derivatives(case, sign):
+    P, Q = cameras(np.random.default_rng(0))[case]
+    P, Q = sign * P, np.array(Q)
+    depth = float(K.project(P, Q)[3])
+    step = 1e-3 * abs(depth) / np.abs([*P.ravel(), *Q]).max()
+    Z_P, Z_Q = K.log_depth_derivatives(P, Q)
+    assert_jacobian(lambda x: np.log(abs(K.project(x, Q)[3])), P, Z_P.reshape(3, 4), step=step)
+    assert_jacobian(lambda x: np.log(abs(K.project(P, x)[3])), Q, Z_Q, step=step)
+
+
+def exponential(E):
+    """Return exp(E) of a matrix of norm below 0.1."""
+    term = total = np.eye(len(E))
+    for k in range(1, 12):
+        term = term @ E / k
+        total = total + term
+    return total
+
+
+def test_generators_are_the_derivatives_of_a_change_of_basis():
+    rng = np.random.default_rng(12)
+    P, Q = rng.standard_normal((3, 4)), rng.standard_normal(4)
+    zero = np.zeros((4, 4))
+    G_P, G_Q = K.camera_generators(P), K.point_generators(Q)
+    assert_jacobian(lambda E: (P @ exponential(E)).ravel(), zero, G_P.reshape(12, 4, 4))
+    assert_jacobian(lambda E: exponential(-E) @ Q, zero, G_Q.reshape(4, 4, 4))
+    # Together they move no image point, and no depth.
+    _, J_P, J_Q, _ = K.project(P, Q)
+    assert np.abs(J_P @ G_P + J_Q @ G_Q).max() <= 1e-12 * np.abs(J_Q).max()
+    Z_P, Z_Q = K.log_depth_derivatives(P, Q)
+    assert np.abs(Z_P @ G_P + Z_Q @ G_Q).max() <= 1e-12 * np.abs(Z_Q).max()
+
+
+def test_scales_move_no_image_point_and_the_depth_by_their_sum():
+    rng = np.random.default_rng(13)
+    P, Q = rng.standard_normal((3, 4)), rng.standard_normal(4)
+    _, J_P, J_Q, _ = K.project(P, Q)
+    Z_P, Z_Q = K.log_depth_derivatives(P, Q)
+    assert np.abs(J_P @ P.ravel()).max() <= 1e-12 * np.abs(J_P).max()
+    assert np.abs(J_Q @ Q).max() <= 1e-12 * np.abs(J_Q).max()
+    assert Z_P @ P.ravel() == pytest.approx(1.0, rel=1e-12)
+    assert Z_Q @ Q == pytest.approx(1.0, rel=1e-12)
+
+
+def test_two_view_structure_derivatives():
+    rng = np.random.default_rng(1)
+    P2, S = rng.standard_normal((3, 4)), rng.standard_normal((3, COUNT))
+    q1, q2 = rng.standard_normal((2, 2, COUNT))
+    r, J_S, J_P2 = K.two_view_structure(P2, S, q1, q2)
+    points = np.stack([S[0], S[1], np.ones(COUNT), S[2]])
+    np.testing.assert_allclose(r[:2], q1 - K.project(np.eye(3, 4), points)[0], atol=1e-14)
+    np.testing.assert_allclose(r[2:], q2 - K.project(P2, points)[0], rtol=1e-12)
+    step = 1e-3 * np.abs(P2[2] @ points).min()
+    for k in range(COUNT):
+        one = (q1[:, k], q2[:, k])
+        assert_jacobian(
+            lambda s, one=one: K.two_view_structure(P2, s, *one)[0], S[:, k], J_S[..., k], step=step
+        )
+        assert_jacobian(
+            lambda p, one=one, k=k: K.two_view_structure(p, S[:, k], *one)[0][2:],
+            P2,
+            J_P2[..., k].reshape(2, 3, 4),
+            step=step,
+        )
+
+
+def vect(matrix):
+    """Return a CasADi matrix row by row."""
+    casadi = pytest.importorskip("casadi")
+    return casadi.vec(matrix.T)
+
+
+def test_projection_derivatives_are_those_casadi_takes():
+    casadi = pytest.importorskip("casadi")
+    from epigauge_generated.casadi_backend import camera
+
+    P, Q = casadi.SX.sym("P", 3, 4), casadi.SX.sym("Q", 4)
+    h = P @ Q
+    q_hat = h[:2] / h[2]
+    own = casadi.Function(
+        "own", [P, Q], [casadi.jacobian(q_hat, vect(P)), casadi.jacobian(q_hat, Q)]
+    )
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        point = rng.standard_normal((3, 4)), rng.standard_normal(4)
+        J_P, J_Q = (np.asarray(J) for J in own(*point))
+        # Two orders of the same dozen operations.
+        assert distance(K.project(*point)[1], J_P) <= 1e-12
+        assert distance(K.project(*point)[2], J_Q) <= 1e-12
+        generated = camera.project()(P=point[0], Q=point[1])
+        assert distance(np.asarray(generated["J_P"]), J_P) <= 1e-12
+
+
+# ---------------------------------------------------------------- criteria without structure
+
+
+CRITERIA = [name for name, s in SIGNATURES.items() if s.outputs[-1].name == "dr_dF"]
+
+
+@pytest.mark.parametrize("name", ["sampson", "algebraic"])
+def test_criterion_derivatives_are_those_casadi_takes(name):
+    casadi = pytest.importorskip("casadi")
+
+    F, q1, q2 = casadi.SX.sym("F", 3, 3), casadi.SX.sym("q1", 2), casadi.SX.sym("q2", 2)
+    C = casadi.bilin(F, casadi.vertcat(q2, 1), casadi.vertcat(q1, 1))
+    r = C
+    if name == "sampson":
+        r = C / casadi.norm_2(casadi.gradient(C, casadi.vertcat(q1, q2)))
+    own = casadi.Function("own", [F, q1, q2], [r, casadi.jacobian(r, vect(F))])
+    rng = np.random.default_rng(4)
+    for case in MATRICES.values():
+        pair = matches(rng, case, 1, 0.3)
+        value, derivative = (np.asarray(x) for x in own(case, *pair))
+        r_, dr_dF = getattr(K, name)(case, *pair)
+        scale = max(1.0, np.abs(derivative).max())
+        assert np.abs(r_ - value).max() <= 1e-12 * scale
+        assert np.abs(dr_dF[..., 0] - derivative).max() <= 1e-12 * scale
+
+
+@pytest.mark.parametrize("name", CRITERIA)
+@pytest.mark.parametrize("case", MATRICES)
+def test_criterion_derivatives(name, case):
+    F = MATRICES[case] / np.linalg.norm(MATRICES[case])
+    q1, q2 = matches(np.random.default_rng(5), F, COUNT, 0.1)
+    _, dr_dF = getattr(K, name)(F, q1, q2)
+    expected = central_differences(lambda x: getattr(K, name)(x, q1, q2)[0], F, STEP)
+    expected = np.moveaxis(expected.reshape(-1, COUNT, 9), 1, 2)
+    assert distance(dr_dF, expected) <= TOLERANCE
+
+
+def cauchy(s, scale2):
+    """Return rho' and rho'' of rho(s) = c^2 log(1 + s / c^2)."""
+    first = 1.0 / (1.0 + s / scale2)
+    return first, -(first**2) / scale2
+
+
+SCALE2 = 0.3**2
+
+
+@pytest.mark.parametrize("robust", [False, True], ids=["plain", "cauchy"])
+@pytest.mark.parametrize("name", ["sampson", "epipolar"])
+@pytest.mark.parametrize("case", MATRICES)
+def test_criterion_gradient_and_hessian(name, case, robust):
+    F = MATRICES[case] / np.linalg.norm(MATRICES[case])
+    pair = matches(np.random.default_rng(6), F, COUNT, 0.1)
+
+    def squares(x):
+        return np.sum(getattr(K, name)(x, *pair)[0] ** 2, axis=0)
+
+    def cost(x):
+        s = squares(x)
+        return 0.5 * np.sum(SCALE2 * np.log1p(s / SCALE2) if robust else s)
+
+    def weights(x):
+        first, second = cauchy(squares(x), SCALE2)
+        # `curvature` multiplies the square of the gradient of s / 2.
+        return (first, 2.0 * second) if robust else (np.ones(COUNT), np.zeros(COUNT))
+
+    def gradient(x):
+        return getattr(K, f"{name}_newton")(x, *pair, *weights(x))[0]
+
+    g, H = getattr(K, f"{name}_newton")(F, *pair, *weights(F))
+    assert distance(g, central_differences(cost, F, STEP).ravel()) <= TOLERANCE
+    assert distance(unpack(H), central_differences(gradient, F, STEP).reshape(9, 9)) <= TOLERANCE
+    r, dr_dF = getattr(K, name)(F, *pair)
+    weight = weights(F)[0]
+    N = np.einsum("kin,kjn,n->ij", dr_dF, dr_dF, weight)
+    got, packed = getattr(K, f"{name}_gauss_newton")(F, *pair, weight)
+    assert distance(unpack(packed), N) <= 1e-13
+    assert distance(got, np.einsum("kin,kn,n->i", dr_dF, r, weight)) <= 1e-13
+
+
+# ---------------------------------------------------------------- exact reprojection error
+
+
+def foot(F, pair):
+    """Return frame, multiplier and distance of matches."""
+    frame = K.bilinear_frame(F)
+    multiplier, _, d = K.foot_point_safe(*frame, *pair)
+    return frame, multiplier, d
+
+
+def to_images(frame):
+    """Return the matrix that takes derivatives by the rotated F to derivatives by F."""
+    R1, R2 = np.eye(3), np.eye(3)
+    R1[:2, :2], R2[:2, :2] = frame[:2]
+    return np.kron(R2, R1)
+
+
+@pytest.mark.parametrize("case", MATRICES)
+def test_distance_derivative(case):
+    F = MATRICES[case] / np.linalg.norm(MATRICES[case])
+    pair = matches(np.random.default_rng(7), F, COUNT, 0.1)
+    frame, multiplier, d = foot(F, pair)
+    _, _, dd_dF = K.foot_point_derivative(*frame, *pair, multiplier)
+    assert np.abs(d).min() > 1e-4
+    expected = central_differences(lambda x: foot(x, pair)[2], F, STEP).reshape(COUNT, 9).T
+    assert distance(dd_dF, expected) <= TOLERANCE
+
+
+@pytest.mark.parametrize("case", MATRICES)
+def test_distance_derivative_where_the_distance_is_zero(case):
+    F = MATRICES[case] / np.linalg.norm(MATRICES[case])
+    pair = matches(np.random.default_rng(8), F, COUNT, 0.0)
+    frame, multiplier, _ = foot(F, pair)
+    _, _, dd_dF = K.foot_point_derivative(*frame, *pair, multiplier)
+    # One of the matches is so near an epipole that d changes over a range of 0.01 in F.
+    expected = central_differences(lambda x: foot(x, pair)[2], F, STEP / 100).reshape(COUNT, 9).T
+    assert distance(dd_dF, expected) <= TOLERANCE
+
+
+@pytest.mark.parametrize(
+    ("case", "robust"),
+    [
+        *((case, False) for case in MATRICES),
+        *((case, True) for case in ("general", "sigma 1", "both at infinity", "forward motion")),
+    ],
+)
+def test_reprojection_gradient_and_hessian(case, robust):
+    F = MATRICES[case] / np.linalg.norm(MATRICES[case])
+    pair = matches(np.random.default_rng(9), F, COUNT, 0.1)
+
+    def cost(x):
+        d2 = foot(x, pair)[2] ** 2
+        return 0.5 * np.sum(SCALE2 * np.log1p(d2 / SCALE2) if robust else d2)
+
+    def weights(d):
+        first, second = cauchy(d**2, SCALE2)
+        # `curvature` multiplies the square of the gradient of d^2 / 2.
+        return (first, 2.0 * second) if robust else (np.ones(COUNT), np.zeros(COUNT))
+
+    def derivatives(x):
+        frame, multiplier, d = foot(x, pair)
+        g, H = K.reprojection_newton(*frame, *pair, multiplier, *weights(d))
+        turn = to_images(frame)
+        return turn @ g, turn @ unpack(H) @ turn.T
+
+    g, H = derivatives(F)
+    assert distance(g, central_differences(cost, F, STEP).ravel()) <= TOLERANCE
+    differences = central_differences(lambda x: derivatives(x)[0], F, STEP).reshape(9, 9)
+    assert distance(H, differences) <= TOLERANCE
+
+
+@pytest.mark.parametrize("case", MATRICES)
+def test_gauss_newton_is_made_of_distance_derivatives(case):
+    F = MATRICES[case] / np.linalg.norm(MATRICES[case])
+    pair = matches(np.random.default_rng(10), F, COUNT, 0.1)
+    frame, multiplier, d = foot(F, pair)
+    _, _, dd_dF = K.foot_point_derivative(*frame, *pair, multiplier)
+    weight = np.linspace(0.5, 2.0, COUNT)
+    g, N = K.reprojection_gauss_newton(*frame, *pair, multiplier, weight)
+    turn = to_images(frame)
+    assert distance(turn @ g, dd_dF @ (weight * d)) <= 1e-12
+    assert distance(turn @ unpack(N) @ turn.T, (dd_dF * weight) @ dd_dF.T) <= 1e-12
+
+
+@pytest.mark.parametrize("case", MATRICES)
+def test_hessian_is_gauss_newton_where_the_distances_are_zero(case):
+    F = MATRICES[case] / np.linalg.norm(MATRICES[case])
+    pair = matches(np.random.default_rng(11), F, COUNT, 0.0)
+    frame, multiplier, _ = foot(F, pair)
+    weight = np.ones(COUNT)
+    _, H = K.reprojection_newton(*frame, *pair, multiplier, weight, np.zeros(COUNT))
+    _, N = K.reprojection_gauss_newton(*frame, *pair, multiplier, weight)
+    assert distance(H, N) <= 1e-12
+
+
+def test_every_derivative_is_checked_here():
+    checked = {
+        "rotation_derivatives",
+        "fundamental_derivatives",
+        "canonical_camera_derivatives",
+        "block_derivatives",
+        "block_camera_derivatives",
+        "project",
+        "log_depth_derivatives",
+        "camera_generators",
+        "point_generators",
+        "two_view_structure",
+        "foot_point_derivative",
+        "reprojection_gauss_newton",
+        "reprojection_newton",
+        *CRITERIA,
+        *(f"{name}{kind}_newton" for name in ("sampson", "epipolar") for kind in ("", "_gauss")),
+        *(name for name in SIGNATURES if name.startswith("maps_")),
+    }
+    # Names of outputs that are no derivatives.
+    values = {"r", "F", "P2", "R", "U_new", "V_new", "M_new", "sigma_new", "q_hat", "depth"}
+    values |= {"R1", "R2", "s", "b1", "b2", "f", "multiplier", "last_change", "d", "e"}
+    derived = {n for n, s in SIGNATURES.items() if {a.name for a in s.outputs} - values}
+    assert derived - checked == set()

@@ -1,0 +1,169 @@
+"""What the tests of the many-view part share: simulated scenes, random bases, real tracks, N."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import epigauge as eg
+import numpy as np
+from epigauge import kernels
+from epigauge.multi_view.gauge import Transformation
+from epigauge.multi_view.problem import BundleProblem, BundleState, Linearized
+from epigauge.multi_view.system import BundleSystem, Layout
+from epigauge.two_view.losses import Loss
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def cameras_and_points(
+    n: int = 5, m: int = 100, *, flatness: float = 0.5, seed: int = 0
+) -> eg.Reconstruction:
+    """Return the truth of B03 section 7.1: cameras 10 m from a cube of 1 m, 3 m from each other.
+
+    `flatness` is the points' mean distance from the base plane, which faces the cameras.
+    """
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.5, 0.5, (m, 3))
+    points[:, 2] = flatness * (2.0 * rng.uniform(0.0, 1.0, m) - 1.0)
+    cameras = []
+    for i in range(n):
+        centre = np.array([3.0 * (i - (n - 1) / 2), rng.uniform(-1.0, 1.0), -10.0])
+        forward = -centre / np.linalg.norm(centre)
+        right = np.cross([0.0, 1.0, 0.0], forward)
+        right /= np.linalg.norm(right)
+        R = np.stack([right, np.cross(forward, right), forward])
+        K = np.array([[1000.0, 0.0, 320.0], [0.0, 1000.0, 240.0], [0.0, 0.0, 1.0]])
+        cameras.append(K @ np.column_stack([R, -R @ centre]))
+    return eg.Reconstruction(np.stack(cameras), np.column_stack([points, np.ones(m)]))
+
+
+def observed(
+    truth: eg.Reconstruction, noise_px: float = 1.0, *, seen: float = 1.0, seed: int = 0
+) -> eg.Tracks:
+    """Return noisy observations of points in views, a share `seen` of them, none too few."""
+    rng = np.random.default_rng(1000 + seed)
+    n, m = len(truth.P), len(truth.Q)
+    visible = rng.uniform(size=(m, n)) < seen
+    visible[np.arange(m), np.arange(m) % n] = True
+    visible[np.arange(m), (np.arange(m) + 1) % n] = True
+    point, view = np.nonzero(visible)
+    h = np.einsum("kij,kj->ki", truth.P[view], truth.Q[point])
+    xy = h[:, :2] / h[:, 2:]
+    return eg.Tracks(view, point, xy + noise_px * rng.standard_normal(xy.shape))
+
+
+def with_gross_errors(
+    tracks: eg.Tracks, share: float = 0.05, *, size_px: float = 30.0, seed: int = 0
+) -> tuple[eg.Tracks, NDArray[np.bool_]]:
+    """Return tracks with gross errors in a share of the rows, and which rows are good."""
+    rng = np.random.default_rng(2000 + seed)
+    good = np.ones(len(tracks), dtype=np.bool_)
+    good[rng.choice(len(tracks), round(share * len(tracks)), replace=False)] = False
+    xy = tracks.xy.copy()
+    angle = rng.uniform(0.0, 2.0 * np.pi, len(tracks))
+    error = size_px * rng.uniform(1.0, 3.0, len(tracks))[:, None]
+    xy[~good] += (error * np.column_stack([np.cos(angle), np.sin(angle)]))[~good]
+    return eg.Tracks(tracks.view, tracks.point, xy), good
+
+
+def shaken(
+    reconstruction: eg.Reconstruction, size: float = 0.01, *, seed: int = 0
+) -> eg.Reconstruction:
+    """Return another geometry nearby: relative noise in every camera row and point."""
+    rng = np.random.default_rng(3000 + seed)
+    P, Q = reconstruction.P, reconstruction.Q
+    P = P + size * np.abs(P).mean(axis=2, keepdims=True) * rng.standard_normal(P.shape) * 1e-2
+    return eg.Reconstruction(P, Q + size * rng.standard_normal(Q.shape))
+
+
+def basis(rng: np.random.Generator, condition: float) -> Array:
+    """Return a random (4, 4) matrix of a given condition."""
+    U, V = (np.linalg.qr(rng.standard_normal((4, 4)))[0] for _ in range(2))
+    return np.asarray(U * np.geomspace(1.0, condition, 4) @ V)
+
+
+def gauge_change(
+    rng: np.random.Generator, n: int, m: int, condition: float = 10.0
+) -> Transformation:
+    """Return a random T~: basis of a given condition, scales of both signs over a decade."""
+    gamma, alpha = (np.exp(rng.uniform(-1.1, 1.1, k)) * rng.choice([-1.0, 1.0], k) for k in (n, m))
+    return Transformation(basis(rng, condition), gamma, alpha)
+
+
+def changed(change: Transformation, reconstruction: eg.Reconstruction) -> eg.Reconstruction:
+    """Return a reconstruction in another gauge."""
+    return eg.Reconstruction(*change.apply(reconstruction.P, reconstruction.Q))
+
+
+def real_tracks(data_dir: Path, name: str) -> eg.Tracks:
+    """Return the tracks of a measured set."""
+    with np.load(data_dir / name / "tracks.npz") as z:
+        return eg.Tracks(z["view"], z["point"], z["xy"])
+
+
+# ---------------------------------------------------------------- inside the solver
+
+
+def problem_of(
+    tracks: eg.Tracks,
+    *,
+    embedded: bool = False,
+    loss: Loss | None = None,
+    kind: type[BundleProblem] = BundleProblem,
+    scale: float = 1000.0,
+) -> BundleProblem:
+    """Return the problem with image coordinates in units of `scale` pixels."""
+    layout = Layout(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+    q = np.ascontiguousarray(tracks.xy.T / scale)
+    weights = np.array(tracks.weights)
+    return kind(kernels.table(), layout, q, weights, loss or Loss(), embedded)
+
+
+def in_units(reconstruction: eg.Reconstruction, scale: float = 1000.0) -> tuple[Array, Array]:
+    """Return cameras and points for `problem_of`, in the well-conditioned normalised basis."""
+    P = np.diag([1.0 / scale, 1.0 / scale, 1.0]) @ reconstruction.P
+    return eg.gauge.normalized().transformation(P, reconstruction.Q).apply(P, reconstruction.Q)
+
+
+def small_system(
+    n: int = 4, m: int = 20, *, seen: float = 0.7, seed: int = 0, noise_px: float = 3.0
+) -> tuple[BundleProblem, BundleState, Linearized]:
+    """Return a problem small enough for dense algebra, a state away from its minimum, and N, g."""
+    truth = cameras_and_points(n, m, seed=seed)
+    problem = problem_of(observed(truth, noise_px, seen=seen, seed=seed))
+    state = problem.evaluate(in_units(shaken(truth, seed=seed)))
+    return problem, state, problem.linearize(state)
+
+
+def dense(system: BundleSystem) -> Array:
+    """Return J^T J (and the border's B B^T) as one matrix."""
+    layout = system.layout
+    (n, a), (m, b) = system.g_cameras.shape, system.g_points.shape
+    N = np.zeros((n * a + m * b, n * a + m * b))
+    for i in range(n):
+        N[i * a : (i + 1) * a, i * a : (i + 1) * a] = system.U[i]
+    for j in range(m):
+        rows = slice(n * a + j * b, n * a + (j + 1) * b)
+        N[rows, rows] = system.V[j]
+    for k, (i, j) in enumerate(zip(layout.view, layout.point, strict=True)):
+        rows, columns = slice(i * a, (i + 1) * a), slice(n * a + j * b, n * a + (j + 1) * b)
+        N[rows, columns] = system.W[k]
+        N[columns, rows] = system.W[k].T
+    if system.border is not None:
+        r = system.border[0].shape[2]
+        B = np.concatenate([part.reshape(-1, r) for part in system.border])
+        N += B @ B.T
+    return N
+
+
+def block_diagonal(blocks: tuple[Array, Array]) -> Array:
+    """Return the blocks of cameras and of points as one matrix, rows by columns."""
+    shapes = [(len(part) * part.shape[1], len(part) * part.shape[2]) for part in blocks]
+    result = np.zeros((shapes[0][0] + shapes[1][0], shapes[0][1] + shapes[1][1]))
+    row = column = 0
+    for part in blocks:
+        for block in part:
+            result[row : row + block.shape[0], column : column + block.shape[1]] = block
+            row, column = row + block.shape[0], column + block.shape[1]
+    return result

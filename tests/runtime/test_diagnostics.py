@@ -1,0 +1,149 @@
+"""Flags: raised on scenes that do not determine F, silent on those that do."""
+
+from __future__ import annotations
+
+import epigauge as eg
+import numpy as np
+import pytest
+from epigauge.two_view.diagnostics import FLAGS, _variance_ratio_99, fit_homography
+from two_views import Array, homogeneous, inliers
+
+FOCAL = 1000.0
+CENTRE = np.array([512.0, 384.0])
+
+
+def turned(rng: np.random.Generator) -> Array:
+    """A rotation by 3 to 17 degrees about a random axis."""
+    axis = rng.standard_normal(3)
+    angle = rng.uniform(0.05, 0.3)
+    C = np.cross(np.eye(3), -axis / np.linalg.norm(axis))
+    return np.asarray(np.eye(3) + np.sin(angle) * C + (1 - np.cos(angle)) * C @ C)
+
+
+def scene(kind: str, m: int, noise: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Matches of one camera in two positions: "general", "planar" or "rotation"."""
+    rays = np.column_stack([rng.uniform(-0.4, 0.4, m), rng.uniform(-0.3, 0.3, m), np.ones(m)])
+    X = rays * rng.uniform(4, 8, m)[:, None]
+    if kind == "planar":
+        X = 6 * rays / (rays @ [*rng.uniform(-0.5, 0.5, 2), 1.0])[:, None]
+    t = rng.standard_normal(3)
+    t *= 0.0 if kind == "rotation" else 0.8 / np.linalg.norm(t)
+    views = (X, X @ turned(rng).T + t)
+    x1, x2 = (FOCAL * Y[:, :2] / Y[:, 2:] + CENTRE for Y in views)
+    return x1 + noise * rng.standard_normal((m, 2)), x2 + noise * rng.standard_normal((m, 2))
+
+
+def shares(kind: str, m: int, noise: float, trials: int, **options: object) -> dict[str, float]:
+    """How often each flag is raised."""
+    rng = np.random.default_rng(7)
+    raised = [
+        eg.refine_fundamental(*scene(kind, m, noise, rng), max_iter=40, **options).flags
+        for _ in range(trials)
+    ]
+    return {flag: np.mean([flag in flags for flags in raised]) for flag in FLAGS}
+
+
+class TestSimulated:
+    @pytest.mark.parametrize(("m", "noise"), [(20, 0.3), (50, 1.5), (200, 0.5)])
+    def test_general_scene_raises_nothing(self, m, noise) -> None:
+        share = shares("general", m, noise, 12)
+        assert share.pop("near-affine") <= 0.2
+        assert not any(share.values()), share
+
+    @pytest.mark.parametrize(("m", "noise"), [(12, 0.5), (20, 1.5), (50, 0.3), (200, 1.0)])
+    @pytest.mark.parametrize("kind", ["planar", "rotation"])
+    def test_homographies_are_told(self, kind, m, noise) -> None:
+        share = shares(kind, m, noise, 12)
+        # 95 % over 60 trials with few matches, 99 % with many; two slips in 12 are allowed
+        assert share["planar scene"] >= 0.8
+        if kind == "rotation":
+            assert share["pure rotation"] >= 0.8
+        elif m >= 50:
+            assert share["pure rotation"] <= 0.3  # a plane may look like it by chance
+
+    @pytest.mark.parametrize("kind", ["planar", "rotation"])
+    def test_without_noise_too(self, kind) -> None:
+        x1, x2 = scene(kind, 40, 0.0, np.random.default_rng(1))
+        flags = eg.refine_fundamental(x1, x2).flags
+        assert "planar scene" in flags
+        assert ("pure rotation" in flags) == (kind == "rotation")
+
+    def test_few_matches_are_told(self) -> None:
+        for m, expected in ((14, True), (15, False)):
+            x1, x2 = scene("general", m, 0.3, np.random.default_rng(2))
+            assert ("few matches" in eg.refine_fundamental(x1, x2).flags) == expected
+
+    def test_near_affine_at_a_distance_only(self) -> None:
+        share = []
+        for distance in (2.0, 16.0):
+            views = [eg.two_view_scene(distance, seed=seed) for seed in range(8)]
+            flags = [eg.refine_fundamental(view.x1, view.x2).flags for view in views]
+            share.append(np.mean(["near-affine" in raised for raised in flags]))
+        assert share[0] == 0
+        assert share[1] > 0.7
+
+    def test_weak_geometry_grows_with_distance(self) -> None:
+        share = []
+        for distance in (5.0, 14.0):
+            views = [eg.two_view_scene(distance, seed=seed) for seed in range(10)]
+            flags = [eg.refine_fundamental(view.x1, view.x2).flags for view in views]
+            share.append(np.mean(["weak geometry" in raised for raised in flags]))
+        assert share[0] == 0
+        assert share[1] >= 0.3
+
+    def test_flags_do_not_depend_on_the_noise_that_the_caller_believes(self) -> None:
+        view = eg.two_view_scene(8.0, seed=0)
+        flags = [
+            eg.refine_fundamental(view.x1, view.x2, noise_px=noise).flags
+            for noise in (0.01, 1.0, 100.0, None)
+        ]
+        assert len(set(flags)) == 1
+
+    def test_matches_that_contradict_the_orientation_are_told(self) -> None:
+        view = eg.two_view_scene(4.0, noise_px=0.1, n_points=60, seed=2)
+        X = view.X.copy()
+        X[:3] = [[3.0, 0.1 * k, -3.75, 1.0] for k in range(3)]  # behind one of the cameras
+        h1, h2 = X @ view.P1.T, X @ view.P2.T
+        assert (h1[:3, 2] * h2[:3, 2] < 0).all()
+        x1, x2 = h1[:, :2] / h1[:, 2:], h2[:, :2] / h2[:, 2:]
+        assert "not oriented" in eg.refine_fundamental(x1, x2, view.F_true).flags
+
+
+class TestMeasured:
+    def test_only_the_rectified_pair_is_flagged(self, pair) -> None:
+        x1, x2 = inliers(pair)
+        flags = eg.refine_fundamental(x1, x2).flags
+        # Rectified images: F is affine indeed, both epipoles at infinity
+        assert flags == (("near-affine",) if pair.stem == "motorcycle_rectified" else ())
+
+
+class TestParts:
+    def test_homography_fit_is_exact_without_noise_and_near_the_optimum_with_it(self) -> None:
+        rng = np.random.default_rng(0)
+        H = np.array([[1.1, 0.1, 0.3], [-0.2, 0.9, -0.4], [0.05, -0.02, 1.0]])
+        q1 = rng.uniform(-2, 2, (2, 60))
+        h = H @ homogeneous(q1.T).T
+        q2 = h[:2] / h[2]
+        weights = np.ones(60)
+        G, cost, _ = fit_homography(q1, q2, weights)
+        np.testing.assert_allclose(G / G[2, 2], H, rtol=0, atol=1e-9)
+        assert cost < 1e-20
+        noise = 1e-3
+        noisy = [q + noise * rng.standard_normal(q.shape) for q in (q1, q2)]
+        _, cost, _ = fit_homography(*noisy, weights)
+        # chi-square with 2 * 60 - 8 degrees of freedom: 112, deviation 15
+        assert cost / noise**2 == pytest.approx(112, abs=45)
+
+    def test_quantile_of_the_variance_ratio_is_fishers(self) -> None:
+        stats = pytest.importorskip("scipy.stats")
+        for above, below in ((16, 5), (32, 13), (92, 43), (2000, 990)):
+            expected = stats.f.ppf(0.99, above, below)
+            # The cube root is nearly normal: better than a tenth at the smallest degrees
+            assert _variance_ratio_99(above, below) == pytest.approx(expected, rel=0.1)
+
+    def test_every_flag_is_explained(self) -> None:
+        view = eg.two_view_scene(20.0, seed=1)
+        result = eg.refine_fundamental(view.x1, view.x2, starts=6)
+        assert result.flags
+        assert set(result.flags) <= set(FLAGS)
+        assert result.flags == tuple(flag for flag in FLAGS if flag in result.flags)
