@@ -132,6 +132,7 @@ class TestConvergence:
         problem = rosenbrock()
         out = run(problem, ROSENBROCK_START, stopping=Stopping(0.0, 0.0, 0.0, max_iter))
         costs = [0.5 * np.sum(problem.residual(x) ** 2) for x in problem.evaluations]
+        assert (out.status, out.nit) == (0, max_iter)
         assert out.state.cost == min(costs)
         assert out.state.cost <= costs[0]
         # The system belongs to the state: callers take covariance and gradient from it.
@@ -246,6 +247,7 @@ class TestEndings:
 
         out = run(linear(), [7.0, -3.0], damping=NoStep())
         assert (out.status, out.nit) == (2, 1)
+        assert not out.history[-1].accepted  # it gained nothing
         np.testing.assert_array_equal(out.state.x, [7.0, -3.0])
 
     def test_lambda_grows_to_its_ceiling_and_not_beyond(self) -> None:

@@ -135,14 +135,14 @@ def test_report_escapes_and_marks_verdicts(tmp_path):
 
 def test_unknown_experiment_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(ArgumentError, match="--only"):
-        bs2004.reproduce(tmp_path / "out", Study(trials=1), {}, ["fig9"])
+        bs2004.PAPER.reproduce(tmp_path / "out", Study(trials=1), {}, ["fig9"])
     assert not (tmp_path / "out").exists()
 
 
 def test_error_panels_are_deterministic(tmp_path, easy):
     pytest.importorskip("matplotlib", reason="figures need matplotlib")
     for run in ("a", "b"):
-        bs2004.reproduce(tmp_path / run, Study(trials=1, seed=5), {}, ["fig1a"])
+        bs2004.PAPER.reproduce(tmp_path / run, Study(trials=1, seed=5), {}, ["fig1a"])
     for name in ("fig1a.csv", "fig1a.png"):
         a, b = ((tmp_path / run / "bs2004" / name).read_bytes() for run in ("a", "b"))
         assert a == b

@@ -90,13 +90,18 @@ class TestMonteCarlo:
             np.testing.assert_allclose(e.std(axis=0)[1:], predicted[1:], rtol=0.065)
 
     def test_near_affine_scene_departs_from_first_order(self) -> None:
-        # The paper's noise at 10 m: 400 scenes show it, the largest eigenvalue by 20 to 50 %
+        # The paper's noise at 10 m. The 9x9 stays within the sampling error of 400 scenes, the
+        # deviation of the epipole does not: about a third above the prediction, error 3.5 %.
         simulation = Simulation(10.0, 2.0**0.5, 400)
         values = simulation.eigenvalues()
         low, high = bounds(400)
-        assert not (low < values.min() and values.max() < high) or values.max() > 1.2
-        assert values.max() < 3.0
-        assert values.min() > 0.3
+        e0 = simulation.truth.epipole1
+        e = np.array([result.epipole1 for result in simulation.results])
+        e *= np.sign(e @ e0)[:, None]
+        ratio = e[:, 1].std() / np.sqrt(simulation.truth.epipole_covariance(1)[1, 1])
+        assert low < values.min()
+        assert values.max() < high
+        assert 1.15 < ratio < 1.6
 
     @pytest.mark.parametrize("loss", ["huber", "cauchy", "soft_l1", "truncated"])
     def test_robust_losses_predict_their_own_covariance(self, loss) -> None:

@@ -17,20 +17,26 @@ import epigauge as eg
 from epigauge._arguments import as_count
 from epigauge.cli._common import DONE, console, shown
 from epigauge.cli.info import processor, version
-from epigauge.reproduce import bs2004
+from epigauge.reproduce import b2003, bs2004
 from epigauge.reproduce.common import Study
+from epigauge.reproduce.gauge_runs import GaugeStudy
 
 
 class Paper(StrEnum):
     """The papers whose experiments can be repeated."""
 
     bs2004 = "bs2004"
+    b2003 = "b2003"
 
 
 def reproduce(
-    paper: Annotated[Paper, typer.Argument(help="Bartoli & Sturm 2004.")],
+    paper: Annotated[Paper, typer.Argument(help="Bartoli & Sturm 2004, or Bartoli 2003.")],
     only: Annotated[
-        list[str] | None, typer.Option(help=f"Experiments: {', '.join(bs2004.EXPERIMENTS)}.")
+        list[str] | None,
+        typer.Option(
+            help=f"Experiments of bs2004: {', '.join(bs2004.EXPERIMENTS)}; of b2003: "
+            f"{', '.join(b2003.EXPERIMENTS)}."
+        ),
     ] = None,
     trials: Annotated[int, typer.Option(help="Trials a configuration; the paper has 100.")] = 10,
     output: Annotated[
@@ -53,16 +59,19 @@ def reproduce(
     def progress(items: Sequence[Any], label: str) -> Iterable[Any]:
         return track(items, label, console=out, transient=True, disable=not out.is_terminal)
 
-    study = Study(trials, seed, _pairs(), progress)
-    for path in bs2004.reproduce(output, study, _machine(), names):
+    data = Path(os.environ.get("EPIGAUGE_DATA", Path("..", "shared", "data")))
+    study: Study | GaugeStudy
+    if paper is Paper.bs2004:
+        pairs = data / "pairs"
+        work, study = bs2004.PAPER, Study(trials, seed, pairs if pairs.is_dir() else None, progress)
+    else:
+        work, study = (
+            b2003.PAPER,
+            GaugeStudy(trials, seed, data if data.is_dir() else None, progress),
+        )
+    for path in work.reproduce(output, study, _machine(), names):
         out.print(escape(shown(path)), soft_wrap=True)
     return DONE
-
-
-def _pairs() -> Path | None:
-    """Return the directory of measured pairs, or None."""
-    directory = Path(os.environ.get("EPIGAUGE_DATA", Path("..", "shared", "data"))) / "pairs"
-    return directory if directory.is_dir() else None
 
 
 def _machine() -> dict[str, str]:

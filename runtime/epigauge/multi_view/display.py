@@ -25,17 +25,17 @@ Indices = NDArray[np.intp]
 
 #: Focal lengths tried, in units of width plus height of what the views show.
 _FOCAL = np.geomspace(0.25, 4.0, 17)
-#: Usual deviations: of the principal point, in those units; of the logarithm of the aspect ratio;
+#: Usual deviations: of the principal point, in focal lengths; of the logarithm of the aspect ratio;
 #: of the skew, in radians; of the logarithm of the focal length from the common one, and of that
 #: from 0.7 units.
 _CENTRE, _ASPECT, _SKEW, _SAME_FOCAL, _ANY_FOCAL = 0.05, 0.05, 0.05, 0.1, 0.5
-#: Deviations beyond so many usual ones grow slowly.
+#: A camera's deviation grows slowly beyond so many usual ones.
 _GROSS = 5.0
 #: Penalty where every point is behind the cameras, in squared usual deviations.
 _BEHIND = 1e4
 _PAIRS, _OBSERVATIONS, _REFINED = 60, 4000, 6
-#: Points farther from the middle than so many times the usual are not shown.
-_FAR = 8.0
+#: Points farther from the middle are not shown, cameras farther away moved in.
+FAR_POINT, FAR_CAMERA = 8.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Display:
     points : ndarray, shape (m, 3)
         Points; not finite at infinity.
     centres : ndarray, shape (n, 3)
-        Centres of the cameras.
+        Centres of the cameras; those farther than `FAR_CAMERA` are put there, in their direction.
     corners : ndarray, shape (n, 4, 3)
         For each camera the directions in which it sees the corners of what the views show.
     shown : ndarray of bool, shape (m,)
@@ -103,9 +103,12 @@ def display(reconstruction: Reconstruction, tracks: Tracks) -> Display:
     P, Q = P @ upright, np.linalg.solve(upright, Q.T).T
     with np.errstate(divide="ignore", invalid="ignore"):
         points = Q[:, :3] / Q[:, 3:]
-        far = ~(np.linalg.norm(points, axis=1) < _FAR)
+        far = ~(np.linalg.norm(points, axis=1) < FAR_POINT)
     box = (np.array([low, (high[0], low[1]), high, (low[0], high[1])]) - to_pixels[:2, 2]) / unit
-    return Display(points, *_pyramids(P, box), ~(behind | far), there.T @ T @ upright)
+    centres, corners = _pyramids(P, box)
+    distances = np.linalg.norm(centres, axis=1, keepdims=True)
+    centres = centres * (FAR_CAMERA / np.maximum(distances, FAR_CAMERA))
+    return Display(points, centres, corners, ~(behind | far), there.T @ T @ upright)
 
 
 def _best_basis(P: Array, Q: Array, tracks: Tracks) -> Array:
@@ -153,8 +156,8 @@ def _unlikely(P: Array) -> float:
 def _deviations(P: Array) -> Array:
     """Return how far cameras are from usual ones, in usual deviations; large ones grow slowly.
 
-    Along a long sequence a projective reconstruction drifts: not all of its cameras can be usual
-    in one basis.
+    A camera with few points is badly determined, and a long sequence drifts: not all cameras of a
+    projective reconstruction can be usual in one basis.
     """
     # K K^T = (f^2 + s^2 + u^2, ...), up to scale.
     M = P[:, :, :3]
@@ -163,17 +166,19 @@ def _deviations(P: Array) -> Array:
     u, v = dual[:, 0, 2], dual[:, 1, 2]
     xx, yy = (np.maximum(dual[:, k, k] - dual[:, k, 2] ** 2, 1e-12) for k in (0, 1))
     log_f = 0.25 * np.log(xx * yy)
-    r = np.concatenate(
+    f = np.exp(log_f)
+    cameras = np.stack(
         [
-            u / _CENTRE,
-            v / _CENTRE,
+            u / f / _CENTRE,
+            v / f / _CENTRE,
             0.5 * np.log(xx / yy) / _ASPECT,
-            (dual[:, 0, 1] - u * v) / np.sqrt(xx * yy) / _SKEW,
-            (log_f - log_f.mean()) / _SAME_FOCAL,
-            [(log_f.mean() - np.log(0.7)) / _ANY_FOCAL],
+            (dual[:, 0, 1] - u * v) / f**2 / _SKEW,
+            (log_f - np.median(log_f)) / _SAME_FOCAL,
         ]
     )
-    return np.asarray(np.sign(r) * _GROSS * np.sqrt(np.log1p((r / _GROSS) ** 2)))
+    size = np.sum(cameras**2, axis=0)
+    cameras = cameras * _GROSS * np.sqrt(np.log1p(size / _GROSS**2) / np.maximum(size, 1e-300))
+    return np.append(cameras.ravel(), (np.median(log_f) - np.log(0.7)) / _ANY_FOCAL)
 
 
 @dataclass(frozen=True)

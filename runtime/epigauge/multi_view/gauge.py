@@ -180,14 +180,14 @@ class reference_camera:
     def transformation(self, P: Array, Q: Array) -> Transformation:
         """Return what moves cameras and points into the gauge."""
         T = _camera_basis(P[self.camera])
-        Q = np.linalg.solve(T, Q.T).T
-        plane, depth = Q[:, :3] / Q[:, 2:3], Q[:, 3] / Q[:, 2]
+        there = np.asarray(np.linalg.solve(T, Q.T).T)
+        plane, depth = there[:, :3] / there[:, 2:3], there[:, 3] / there[:, 2]
         across, *_ = np.linalg.lstsq(plane, depth, rcond=None)
         size = float(np.sqrt(np.mean((depth - plane @ across) ** 2)))
         # (q, c) <- (q, (c - across q) / size)
         slide = np.eye(4)
         slide[3, :3], slide[3, 3] = across, size
-        return _scaled(T @ slide, P, Q[:, 2], self.camera)
+        return _scaled(T @ slide, P, there[:, 2], self.camera)
 
 
 @dataclass(frozen=True)

@@ -193,11 +193,12 @@ class BundleSystem:
         Y = self.W @ V_inverse[layout.point]
         right = cameras - layout.sum_views(Y @ points[layout.point])
         n, a, r = right.shape
+        x: Array
         if n <= DENSE_CAMERAS or moves is not None:
             S = self._reduced_matrix()
             if moves is not None:
                 S += moves @ moves.T
-            x = np.linalg.solve(S, right.reshape(n * a, r)).reshape(n, a, r)
+            x = np.asarray(np.linalg.solve(S, right.reshape(n * a, r))).reshape(n, a, r)
         else:
             x = np.stack([self._conjugate_gradients(Y, right[..., k]) for k in range(r)], axis=2)
         coupled = layout.sum_points(np.swapaxes(self.W, 1, 2) @ x[layout.view])
@@ -232,9 +233,8 @@ class BundleSystem:
 
         def reduced(x: Array) -> Array:
             inner = layout.sum_points(np.einsum("nij,ni->nj", Y, x[layout.view]))
-            return np.einsum("nij,nj->ni", self.U, x) - layout.sum_views(
-                np.einsum("nij,nj->ni", self.W, inner[layout.point])
-            )
+            outer = layout.sum_views(np.einsum("nij,nj->ni", self.W, inner[layout.point]))
+            return np.asarray(np.einsum("nij,nj->ni", self.U, x) - outer)
 
         x = np.zeros_like(right)
         residual = right.copy()

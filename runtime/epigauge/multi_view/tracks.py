@@ -192,7 +192,7 @@ class Reconstruction:
     def project(self, tracks: Tracks) -> Array:
         """Return the predicted pixels of all observations, shape (N, 2), in the tracks' order."""
         h = np.einsum("nij,nj->ni", self.P[tracks.view], self.Q[tracks.point])
-        return h[:, :2] / h[:, 2:]
+        return np.asarray(h[:, :2] / h[:, 2:])
 
     def rms_px(self, tracks: Tracks) -> float:
         """Return sqrt(sum of squared residual coordinates / (2 N))."""

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from epigauge.reproduce import gauge_experiments
 from epigauge.reproduce.gauge_runs import GaugeStudy
 from epigauge.reproduce.report import Section
+from epigauge.reproduce.run import Paper
 
-__all__ = ["EXPERIMENTS", "TITLE", "introduction"]
+__all__ = ["EXPERIMENTS", "PAPER"]
 
 #: The experiments by name, in the order of the report.
 EXPERIMENTS: dict[str, Callable[[GaugeStudy], Section]] = {
@@ -20,8 +21,6 @@ EXPERIMENTS: dict[str, Callable[[GaugeStudy], Section]] = {
     "starts": gauge_experiments.starts,
 }
 
-TITLE = "Bartoli 2003, reproduced"
-
 
 def introduction(study: GaugeStudy) -> list[str]:
     """Return the paragraphs above the claims."""
@@ -32,3 +31,6 @@ def introduction(study: GaugeStudy) -> list[str]:
         "LEVENBERG and MARQUARDT leave everything free and damp by lambda I and lambda diag(N); "
         "COVARIANT is ours: covariant damping and re-triangulated points.",
     ]
+
+
+PAPER = Paper("b2003", "Bartoli 2003, reproduced", EXPERIMENTS, introduction)

@@ -82,8 +82,8 @@ def flatness(study: GaugeStudy) -> Section:
         ]
     )
     header = ("method", *[f"d = {d:g}" for d in FLATNESS])
-    rows = [(label, *map(float, row)) for label, row in zip(labels, mean_steps, strict=True)]
-    shares = [(label, *map(float, row)) for label, row in zip(labels, reached, strict=True)]
+    rows = _labelled(labels, mean_steps)
+    shares = _labelled(labels, reached)
     at = {name: i for i, name in enumerate(LABELS)}
     fixed = [at[name] for name in ("hartley", "bartoli", "mclauchlan", "kanatani")]
     paper = [at[name] for name in _HOTEL if name != "gauge_invariant"]
@@ -160,6 +160,11 @@ def flatness(study: GaugeStudy) -> Section:
     )
 
 
+def _labelled(labels: list[str], numbers: Array) -> list[tuple[str | float, ...]]:
+    """Return rows of a table: a label, then numbers."""
+    return [(label, *map(float, row)) for label, row in zip(labels, numbers, strict=True)]
+
+
 def iterations(study: GaugeStudy) -> Section:
     """Figure 1, right: error against the iterations at d = 0.5."""
     length = 8
@@ -182,7 +187,7 @@ def iterations(study: GaugeStudy) -> Section:
     )
     first = {label: float(curve[1]) for label, curve in mean.items()}
     lowest = min(first, key=lambda label: first[label])
-    rows = [(label, *map(float, curve)) for label, curve in mean.items()]
+    rows = _labelled(list(mean), np.array(list(mean.values())))
     return Section(
         "Figure 1, right: error against iterations",
         [
