@@ -7,13 +7,24 @@
 
 from epigauge import casadi, kernels
 from epigauge.errors import ArgumentError, BackendError, EpigaugeError, FileFormatError
-from epigauge.io import Matches, load_matches, save_matches, save_result
+from epigauge.io import (
+    Matches,
+    load_matches,
+    load_reconstruction,
+    load_tracks,
+    save_matches,
+    save_reconstruction,
+    save_result,
+    save_tracks,
+)
 from epigauge.kernels import backend, set_backend
 from epigauge.multi_view import gauge
 from epigauge.multi_view.adjust import BundleResult, bundle_adjust
+from epigauge.multi_view.compare import Comparison, compare
 from epigauge.multi_view.initialize import initialize
 from epigauge.multi_view.tracks import Reconstruction, Tracks
-from epigauge.scenes import TwoViewScene, two_view_scene
+from epigauge.multi_view.uncertainty import ReconstructionCovariance, covariance
+from epigauge.scenes import MultiViewScene, TwoViewScene, multi_view_scene, two_view_scene
 from epigauge.two_view.batch import BATCH_STATUS, FundamentalBatch, refine_fundamental_batch
 from epigauge.two_view.geometry import (
     canonical_cameras,
@@ -33,12 +44,15 @@ __all__ = [
     "ArgumentError",
     "BackendError",
     "BundleResult",
+    "Comparison",
     "EpigaugeError",
     "FileFormatError",
     "FundamentalBatch",
     "FundamentalResult",
     "Matches",
+    "MultiViewScene",
     "Reconstruction",
+    "ReconstructionCovariance",
     "RobustResult",
     "Tracks",
     "TwoViewScene",
@@ -46,6 +60,8 @@ __all__ = [
     "bundle_adjust",
     "canonical_cameras",
     "casadi",
+    "compare",
+    "covariance",
     "estimate_fundamental",
     "fundamental_7point",
     "fundamental_8point",
@@ -53,12 +69,17 @@ __all__ = [
     "initialize",
     "kernels",
     "load_matches",
+    "load_reconstruction",
+    "load_tracks",
+    "multi_view_scene",
     "refine_fundamental",
     "refine_fundamental_batch",
     "reprojection_distances",
     "sampson_distances",
     "save_matches",
+    "save_reconstruction",
     "save_result",
+    "save_tracks",
     "set_backend",
     "triangulate",
     "two_view_scene",

@@ -24,6 +24,7 @@ __all__ = [
     "as_fundamental",
     "as_matches",
     "as_positive",
+    "as_real",
     "as_weights",
     "check_general_position",
 ]
@@ -181,7 +182,7 @@ def as_fundamental(F0: ArrayLike, name: str = "F0") -> Array:
     ArgumentError
         On another shape or type, NaN, infinity, or a matrix of zeros.
     """
-    F = _real(name, F0, "a (3, 3) matrix")
+    F = as_real(name, F0, "a (3, 3) matrix")
     if F.shape != (3, 3):
         raise ArgumentError(name, f"has shape {F.shape}", "a (3, 3) matrix")
     if not np.isfinite(F).all():
@@ -310,7 +311,7 @@ def as_weights(weights: ArrayLike, m: int) -> Array:
         On another shape or type, a negative, infinite or NaN weight (the first is named), or
         weights that are all zero.
     """
-    w = _real("weights", weights, f"an ({m},) array")
+    w = as_real("weights", weights, f"an ({m},) array")
     if w.shape != (m,):
         raise ArgumentError("weights", f"has shape {w.shape}", f"({m},): one weight a match")
     bad = np.flatnonzero(~(np.isfinite(w) & (w >= 0.0)))
@@ -345,7 +346,7 @@ def as_covariances(name: str, value: ArrayLike, m: int) -> Array:
         its largest entry) or not positive definite (the first such row is named).
     """
     needed = f"a (2, 2) or ({m}, 2, 2) array"
-    covariances = _real(name, value, needed)
+    covariances = as_real(name, value, needed)
     if covariances.shape not in ((2, 2), (m, 2, 2)):
         raise ArgumentError(name, f"has shape {covariances.shape}", needed)
     covariances = np.broadcast_to(covariances, (m, 2, 2))
@@ -363,7 +364,7 @@ def as_covariances(name: str, value: ArrayLike, m: int) -> Array:
 
 def _points(name: str, value: ArrayLike) -> Array:
     """Convert one image's points to (m, 2), float64, C-contiguous."""
-    points = _real(name, value, _POINTS)
+    points = as_real(name, value, _POINTS)
     if points.ndim == 3 and points.shape[1:] == (1, 2):
         points = points[:, 0, :]
     if points.ndim != 2 or points.shape[1] != 2:
@@ -398,7 +399,7 @@ def _is_spread(points: Array, eps: float) -> bool:
     )
 
 
-def _real(name: str, value: ArrayLike, needed: str) -> Array:
+def as_real(name: str, value: ArrayLike, needed: str) -> Array:
     """Convert to float64, refusing every type that is not a real number."""
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         raise ArgumentError(name, "is a masked array", f"{needed} without masked entries")

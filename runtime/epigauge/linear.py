@@ -20,8 +20,8 @@ _LIFT = 1e-3
 class _Solvable(Protocol):
     """A linear system that two dampings can be added to."""
 
-    def largest(self) -> float:
-        """Return the largest diagonal entry of the Hessian."""
+    def typical(self) -> float:
+        """Return a typical large diagonal entry of the Hessian."""
 
     def solve(self, lam: float, *, scaled: bool) -> Array:
         """Return -(H + lam W)^-1 g, with W = I or, if scaled, W = diag(J^T J)."""
@@ -29,13 +29,13 @@ class _Solvable(Protocol):
 
 @dataclass(frozen=True)
 class Levenberg:
-    """Damping lambda I, called LM in B&S; the first lambda is relative to the largest diagonal."""
+    """Damping lambda I, called LM in B&S; the first lambda is relative to the diagonal."""
 
     relative: float = 1e-3
 
     def start(self, system: _Solvable) -> float:
-        """Return `relative` times the largest diagonal entry."""
-        return self.relative * max(system.largest(), 1e-300)
+        """Return `relative` times a typical diagonal entry."""
+        return self.relative * max(system.typical(), 1e-300)
 
     def step(self, system: _Solvable, lam: float) -> Array:
         """Return -(H + lam I)^-1 g."""
@@ -78,6 +78,10 @@ class Dense:
     def largest(self) -> float:
         """Return the largest diagonal entry of J^T J."""
         return float(np.max(self.diagonal))
+
+    def typical(self) -> float:
+        """Return the largest diagonal entry of J^T J."""
+        return self.largest()
 
     def solve(self, lam: float, *, scaled: bool) -> Array:
         """Solve in the eigenbasis; lambda is lifted until the damped Hessian is definite."""
@@ -150,6 +154,14 @@ class Arrow:
         """Return the largest diagonal entry."""
         points = np.einsum("mkk->mk", self.V)
         return float(max(np.max(np.diag(self.U)), np.max(points)))
+
+    def typical(self) -> float:
+        """Return the median diagonal entry of the points.
+
+        Entries of the motion are sums over all points, and a point near an epipole has one as
+        large: lambda relative to the largest would hold the other points still for many steps.
+        """
+        return float(np.median(np.einsum("mkk->mk", self.V)))
 
     def solve(self, lam: float, *, scaled: bool) -> Array:
         """Solve by the Schur complement of the points; the border by Woodbury's identity."""

@@ -37,6 +37,7 @@ Array = NDArray[np.float64]
 
 #: Meaning of `status`; positive is success.
 STATUS = {
+    -4: "stopped where the points are not at their minimum for this F: a better start is needed",
     -3: "the cost at the start is not finite",
     -2: "stopped by the callback",
     -1: "no step reduces the cost any further although lambda is at its ceiling",
@@ -177,9 +178,10 @@ class Stopping:
     def __post_init__(self) -> None:
         for name in ("ftol", "xtol", "gtol"):
             value = getattr(self, name)
-            if not (isinstance(value, float | int) and 0.0 <= value < 1.0):
+            if not (isinstance(value, float | int | np.floating) and 0.0 <= value < 1.0):
                 raise ArgumentError(name, f"is {value!r}", "a number in [0, 1)")
-        if not isinstance(self.max_iter, int | np.integer) or self.max_iter < 1:
+        count = isinstance(self.max_iter, int | np.integer) and not isinstance(self.max_iter, bool)
+        if not count or self.max_iter < 1:
             raise ArgumentError("max_iter", f"is {self.max_iter!r}", "an integer of at least 1")
 
 
@@ -256,7 +258,7 @@ def minimize(
     With c the cost, dc > 0 the decrease of an accepted step and g the gradient, the loop ends when
 
     - ``max|g| <= gtol`` (status 1),
-    - ``dc <= ftol * c`` (2),
+    - ``dc <= ftol * c``, c being the cost after the step (2),
     - ``|step| <= xtol`` for an accepted step (3),
     - ``decrement <= ftol * c`` before a step, the decrement being the decrease that the undamped
       quadratic model still promises (4); not all linear systems know it,

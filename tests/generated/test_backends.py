@@ -46,14 +46,17 @@ def inputs(name, batch, seed, F=None):
     """
     rng = np.random.default_rng(seed)
     signature = SIGNATURES[name]
-    wanted = [argument.name for argument in signature.inputs]
     count = int(np.prod(batch))
+    each = any(argument.name == "R1" and argument.batched for argument in signature.inputs)
     if F is None:
-        F = list(fundamental_cases(seed).values())[seed % len(fundamental_cases())]
+        cases = list(fundamental_cases(seed).values())
+        F = pool(cases, batch, rng) if each else cases[seed % len(cases)]
     frame = dict(zip(FRAME, NUMPY.bilinear_frame(F), strict=True))
-    q1, q2 = (2.0 * q for q in matches(rng, F, count, 0.1))
+    q1, q2 = (2.0 * q for q in matches(rng, F if F.ndim == 2 else np.eye(3), count, 0.1))
     if count > 2:
         q2[:, 1] += 30.0  # an outlier
+    q1, q2 = q1.reshape(2, *batch), q2.reshape(2, *batch)
+    foot_point = NUMPY.foot_point_safe_each if each else NUMPY.foot_point_safe
     factors = list(factor_cases(seed).values())
     special = {
         "U": lambda: pool([U for U, _, _ in factors], batch, rng),
@@ -63,12 +66,13 @@ def inputs(name, batch, seed, F=None):
         "theta": lambda: rng.uniform(-4.0, 4.0, (3, *batch)),
         "delta": lambda: rng.uniform(-4.0, 4.0, (7, *batch)),
         "F": lambda: pool(list(fundamental_cases(seed).values()), batch, rng),
-        "q1": lambda: q1.reshape(2, *batch),
-        "q2": lambda: q2.reshape(2, *batch),
-        "l": lambda: np.asarray(NUMPY.foot_point_safe(*frame.values(), q1, q2)[0]).reshape(batch),
+        "q1": lambda: q1,
+        "q2": lambda: q2,
+        "l": lambda: foot_point(*frame.values(), q1, q2)[0],
         "weight": lambda: rng.uniform(0.0, 2.0, batch),
     }
-    if set(FRAME) <= set(wanted):
+    wanted = {argument.name for argument in signature.inputs}
+    if wanted >= set(FRAME):
         special |= {key: (lambda value=value: value) for key, value in frame.items()}
     elif "q1" in wanted:
         special["F"] = lambda: F
@@ -175,6 +179,22 @@ def test_batch_axes_broadcast(table, name):
             a = np.broadcast_to(a, e.shape)
         # Sine and cosine of one number may round differently in and behind a vector.
         assert distance(a, e) <= 1e-14
+
+
+@pytest.mark.parametrize("name", [name for name in SIGNATURES if name.endswith("_each")])
+def test_kernel_of_one_f_each_is_the_shared_kernel_one_by_one(table, name):
+    shared = SIGNATURES[name.removesuffix("_each")]
+    arguments = inputs(name, (20,), 11)
+    together = as_tuple(getattr(table, name)(*arguments))
+    for k in range(20):
+        one = [
+            value[..., k : k + 1] if argument.batched else value[..., k]
+            for argument, value in zip(shared.inputs, arguments, strict=True)
+        ]
+        alone = as_tuple(getattr(table, name.removesuffix("_each"))(*one))
+        for a, e in zip(together, alone, strict=True):
+            # The same expressions, but their common parts may be shared differently.
+            assert distance(a[..., k : k + 1], e) <= 1e-12
 
 
 @pytest.mark.parametrize("name", sorted(SUMMED))

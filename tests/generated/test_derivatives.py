@@ -444,4 +444,5 @@ def test_every_derivative_is_checked_here():
     values = {"r", "F", "P2", "R", "U_new", "V_new", "M_new", "sigma_new", "q_hat", "depth"}
     values |= {"R1", "R2", "s", "b1", "b2", "f", "multiplier", "last_change", "d", "e"}
     derived = {n for n, s in SIGNATURES.items() if {a.name for a in s.outputs} - values}
-    assert derived - checked == set()
+    # A kernel of one F each is compared with the one of a shared F in test_backends.py.
+    assert {name.removesuffix("_each") for name in derived} - checked == set()

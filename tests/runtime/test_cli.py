@@ -210,7 +210,7 @@ def test_markup_in_a_file_name_is_only_a_name(run, pair_file) -> None:
     path = pair_file.rename(pair_file.with_name("[bold red]x[.csv"))
     code, _, err = run("refine", path)
     assert code == 0
-    assert "[bold red]x[.csv" in err.replace("\n", "")
+    assert "[boldred]x[.csv" in "".join(err.split())  # long paths are wrapped
 
 
 def test_standard_deviation_of_sigma_follows_its_derivative() -> None:

@@ -202,7 +202,7 @@ class TestDampings:
         for system in (dense(), arrow()[0]):
             step = Levenberg().step(system, 0.25)
             np.testing.assert_array_equal(step, system.solve(0.25, scaled=False))
-            assert Levenberg(0.5).start(system) == 0.5 * system.largest()
+            assert Levenberg(0.5).start(system) == 0.5 * system.typical()
 
     def test_seber_multiplies_the_diagonal_by_one_plus_lambda(self) -> None:
         for system in (dense(), arrow()[0]):

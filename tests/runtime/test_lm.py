@@ -183,7 +183,8 @@ ENDINGS: dict[int, list[tuple[LeastSquares, Any, dict[str, Any]]]] = {
 
 class TestEndings:
     def test_every_status_has_a_case_and_a_sentence(self) -> None:
-        assert set(ENDINGS) == set(STATUS)
+        # -4 is for a problem's owner to give: see test_two_view_hard_places.
+        assert set(ENDINGS) == set(STATUS) - {-4}
         assert all(STATUS.values())
         assert len(set(STATUS.values())) == len(STATUS)
 

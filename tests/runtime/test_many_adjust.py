@@ -156,12 +156,9 @@ class TestStatus:
 
     def test_equal_cameras_are_told(self, tracks: eg.Tracks, truth: eg.Reconstruction) -> None:
         same = eg.Reconstruction(np.tile(truth.P[0], (5, 1, 1)), truth.Q)
-        try:
-            found = eg.bundle_adjust(tracks, same)
-        except ArgumentError as error:
-            assert error.argument == "start"
-        else:
-            assert np.isfinite(found.rms_px)
+        found = eg.bundle_adjust(tracks, same)
+        assert (found.status, found.success) == (-1, False)
+        assert found.cost == found.history[0].cost
 
     def test_points_in_one_plane_and_behind_cameras(self) -> None:
         flat = many_views.cameras_and_points(flatness=0.0)
@@ -249,15 +246,17 @@ class TestRobust:
         clean = many_views.observed(truth, seed=seed)
         tracks, good = many_views.with_gross_errors(clean, 0.05, seed=seed)
         best = eg.bundle_adjust(clean).reconstruction.project(clean)
+        wrong = np.bincount(tracks.point, ~good) > 0
+        whole = ~wrong[tracks.point]
 
         def error(**options: Any) -> float:
             found = eg.bundle_adjust(tracks, **options).reconstruction.project(clean)
-            return float(np.sqrt(np.mean((found - best)[good] ** 2)))
+            return float(np.sqrt(np.mean((found - best)[whole] ** 2)))
 
         robust = error(loss=loss)
         # Noise of one pixel; without the loss gross errors of 30 to 90 px pull by several.
-        assert robust < (0.4 if loss in ("cauchy", "truncated") else 1.2)
-        assert robust < 0.3 * error()
+        assert robust < 0.2  # measured: 0.05 to 0.17
+        assert robust < 0.1 * error()
 
     @pytest.mark.parametrize("loss", ["huber", "soft_l1", "cauchy", "truncated"])
     def test_cost_is_the_robust_sum(
@@ -370,4 +369,4 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 / unit, result.r
     )
     megabytes, rms = map(float, done.stdout.split())
     assert megabytes < 500.0
-    assert rms < 1.0
+    assert rms < 3.0  # with the tracks that jump

@@ -116,10 +116,11 @@ def test_frame_conditions_and_comes_back() -> None:
 @pytest.mark.parametrize("wrong", [0, 2])
 def test_resection_finds_the_camera(wrong: int) -> None:
     truth = many_views.cameras_and_points(2, 30)
-    P, Q = many_views.in_units(truth)
+    tracks = many_views.observed(truth, 0.0)
+    P, Q = Frame.of(tracks).cameras_in(truth.P), truth.Q
     h = P[1] @ Q.T
     q = h[:2] / h[2:]
-    q[:, :wrong] += 0.2
+    q[:, :wrong] += [[1.0], [-0.5]]
     found = resect(kernels.table(), q, Q.T)
     expected = P[1] / np.linalg.norm(P[1])
     assert np.linalg.norm(found) == pytest.approx(1.0)
@@ -135,12 +136,14 @@ def test_embedded_triangulation_never_raises_the_cost_of_a_point(loss: str) -> N
         tracks = many_views.observed(truth, 2.0, seen=0.6, seed=seed)
         problem = many_views.problem_of(tracks, loss=Loss(loss, 0.003))
         P, Q = many_views.in_units(many_views.shaken(truth, 0.3, seed=seed))
+        if seed > 2:  # from anywhere, where undamped steps overshoot
+            Q = np.random.default_rng(seed).standard_normal(Q.shape)
         before, _ = problem._point_costs(problem.evaluate((P, Q)).r)
         moved = problem.triangulated(P, Q)
         after, _ = problem._point_costs(problem.evaluate((P, moved)).r)
         assert (after <= before).all()
         assert after.sum() < 0.9 * before.sum()
-        if loss == "linear":
+        if loss == "linear" and seed <= 2:
             # Most are at their optimum then: nothing is left to gain along any direction.
             state = problem.evaluate((P, moved))
             gain = problem.linearize(state).g_points

@@ -233,3 +233,28 @@ class TestDegenerateScenes:
         result = eg.refine_fundamental(h1[:, :2] / h1[:, 2:], h2[:, :2] / h2[:, 2:], **form)
         assert_no_nan(result)
         assert result.rank < 7
+
+
+class TestHonesty:
+    def test_joint_solution_with_stuck_points_is_no_success(self) -> None:
+        view = eg.two_view_scene(10, seed=1)
+        result = eg.refine_fundamental(view.x1, view.x2, np.eye(3), structure="joint", max_iter=300)
+        assert result.status == -4
+        assert not result.success
+        assert "start" in result.message
+        # What it warns of: other points for the same F cost far less.
+        assert result.cost > 10.0 * (0.5 * np.sum(result.fun**2))
+
+    def test_match_on_both_epipoles_of_the_start_does_not_stop_the_others(self) -> None:
+        view = eg.two_view_scene(4, motion="forward", seed=1)
+        x1, x2 = np.vstack([view.x1, [0, 0]]), np.vstack([view.x2, [0, 0]])
+        result = eg.refine_fundamental(x1, x2, view.F_true, max_iter=300)
+        joint = eg.refine_fundamental(x1, x2, view.F_true, structure="joint", max_iter=300)
+        assert result.success
+        np.testing.assert_allclose(result.cost, joint.cost, rtol=1e-8)
+
+    def test_sampson_distance_on_both_epipoles_is_zero(self) -> None:
+        view = eg.two_view_scene(4, motion="forward", seed=1)
+        e1, e2 = (np.linalg.svd(F)[2][2] for F in (view.F_true, view.F_true.T))
+        d = eg.sampson_distances(view.F_true, e1[None, :2] / e1[2], e2[None, :2] / e2[2])
+        np.testing.assert_array_equal(d, 0.0)

@@ -1,4 +1,4 @@
-"""Commands for files of matches: human text on stderr, data on stdout.
+"""Commands for files of matches and tracks: human text on stderr, data on stdout.
 
 Exit codes: 0 done, 1 did not converge, 2 bad input. One module a command; a command is a function
 that returns its exit code, registered here.
@@ -12,6 +12,8 @@ import typer
 
 import epigauge as eg
 from epigauge.cli._common import command
+from epigauge.cli.bundle import bundle
+from epigauge.cli.compare import compare
 from epigauge.cli.demo import demo
 from epigauge.cli.info import info
 from epigauge.cli.refine import refine
@@ -46,5 +48,5 @@ def _main(
     """
 
 
-for _function in (demo, refine, info, reproduce):
+for _function in (demo, refine, bundle, compare, info, reproduce):
     app.command()(command(_function))

@@ -1,4 +1,4 @@
-"""Point matches in, results out: CSV, TXT, NPZ and JSON.
+"""Point matches and tracks in, results out: CSV, TXT, BAL, NPZ, JSON and PLY.
 
 Files are untrusted. Nothing is unpickled, sizes are checked before anything is allocated, and a
 file that cannot be used is refused with a `FileFormatError` that names the file, the line where
@@ -11,13 +11,29 @@ from __future__ import annotations
 from epigauge.io._common import MAX_MATCHES
 from epigauge.io.matches import Matches, load_matches, save_matches
 from epigauge.io.output import plain, save_result, writing
+from epigauge.io.ply import save_ply
+from epigauge.io.tracks import (
+    TrackFile,
+    load_reconstruction,
+    load_track_file,
+    load_tracks,
+    save_reconstruction,
+    save_tracks,
+)
 
 __all__ = [
     "MAX_MATCHES",
     "Matches",
+    "TrackFile",
     "load_matches",
+    "load_reconstruction",
+    "load_track_file",
+    "load_tracks",
     "plain",
     "save_matches",
+    "save_ply",
+    "save_reconstruction",
     "save_result",
+    "save_tracks",
     "writing",
 ]

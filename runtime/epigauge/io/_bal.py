@@ -185,4 +185,5 @@ def _rodrigues(R: Array) -> Array:
     sine = float(np.linalg.norm(axis))
     if sine == 0.0:
         return np.zeros(3)
-    return np.asarray(axis) * (2.0 * np.arctan2(sine, abs(w)) / sine) * (-1.0 if w < 0.0 else 1.0)
+    angle = 2.0 * float(np.arctan2(sine, abs(w))) * (-1.0 if w < 0.0 else 1.0)
+    return np.array(axis) * (angle / sine)

@@ -26,7 +26,8 @@ def save_result(path: PathLike, result: Any, **more: Any) -> None:
         The file; ``.npz`` or ``.json`` chooses the form.
     result : dataclass
         A result such as `FundamentalResult`: every field is written under its own name. In NPZ a
-        history becomes one array a column, ``history_cost`` and so on.
+        history becomes one array a column, ``history_cost`` and so on, and a field that is a
+        dataclass itself, such as a reconstruction, its own fields.
     **more
         Further fields to write.
 
@@ -128,6 +129,8 @@ def _arrays(result: Any) -> dict[str, Any]:
         if isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
             for column in _fields(value[0]):
                 arrays[f"{field.name}_{column.name}"] = [getattr(row, column.name) for row in value]
+        elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+            arrays |= _arrays(value)
         elif value is not None:
             arrays[field.name] = value
     return arrays

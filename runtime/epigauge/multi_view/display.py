@@ -24,11 +24,11 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 #: Focal lengths tried, in units of width plus height of what the views show.
-_FOCAL = np.geomspace(0.25, 4.0, 17)
+_FOCAL = np.geomspace(0.25, 12.0, 21)
 #: Usual deviations: of the principal point, in focal lengths; of the logarithm of the aspect ratio;
 #: of the skew, in radians; of the logarithm of the focal length from the common one, and of that
 #: from 0.7 units.
-_CENTRE, _ASPECT, _SKEW, _SAME_FOCAL, _ANY_FOCAL = 0.05, 0.05, 0.05, 0.1, 0.5
+_CENTRE, _ASPECT, _SKEW, _SAME_FOCAL, _ANY_FOCAL = 0.05, 0.05, 0.05, 0.1, 1.0
 #: A camera's deviation grows slowly beyond so many usual ones.
 _GROSS = 5.0
 #: Penalty where every point is behind the cameras, in squared usual deviations.
@@ -81,6 +81,11 @@ def display(reconstruction: Reconstruction, tracks: Tracks) -> Display:
     Display
         What to draw. It is no calibration.
 
+    Notes
+    -----
+    Where the views are nearly affine (a small scene far away) many bases are as plausible: the one
+    chosen may stretch the scene in depth.
+
     References
     ----------
     .. [GF10] R. Gherardi, A. Fusiello, "Practical autocalibration", ECCV 2010: the plane at
@@ -91,16 +96,16 @@ def display(reconstruction: Reconstruction, tracks: Tracks) -> Display:
     to_pixels = np.diag([unit, unit, 1.0])
     to_pixels[:2, 2] = (low + high) / 2.0
     there = normalized().transformation(reconstruction.P, reconstruction.Q)
-    P, Q = there.apply(np.linalg.solve(to_pixels, reconstruction.P), reconstruction.Q)
+    P, Q = there.apply(np.asarray(np.linalg.solve(to_pixels, reconstruction.P)), reconstruction.Q)
     T = _best_basis(P, Q, tracks)
-    P, Q = P @ T, np.linalg.solve(T, Q.T).T
+    P, Q = P @ T, np.asarray(np.linalg.solve(T, Q.T).T)
     depths = _depths(P, Q[tracks.point], tracks.view)
     if np.mean(depths > 0.0) < 0.5:
         mirror = np.diag([1.0, 1.0, 1.0, -1.0])
         T, P, Q, depths = T @ mirror, P @ mirror, Q @ mirror, -depths
     behind = np.bincount(tracks.point, depths <= 0.0, minlength=len(Q)) > 0
     upright = _upright(P, Q[~behind] if (~behind).any() else Q)
-    P, Q = P @ upright, np.linalg.solve(upright, Q.T).T
+    P, Q = P @ upright, np.asarray(np.linalg.solve(upright, Q.T).T)
     with np.errstate(divide="ignore", invalid="ignore"):
         points = Q[:, :3] / Q[:, 3:]
         far = ~(np.linalg.norm(points, axis=1) < FAR_POINT)
@@ -117,12 +122,12 @@ def _best_basis(P: Array, Q: Array, tracks: Tracks) -> Array:
     view, seen = tracks.view[rows], Q[tracks.point[rows]]
 
     def penalty(T: Array) -> float:
-        ahead = float(np.mean(_depths(P @ T, np.linalg.solve(T, seen.T).T, view) > 0.0))
+        ahead = float(np.mean(_depths(P @ T, np.asarray(np.linalg.solve(T, seen.T).T), view) > 0.0))
         return _BEHIND * min(ahead, 1.0 - ahead)
 
     a, b = np.nonzero(~np.eye(len(P), dtype=np.bool_))
     some = np.linspace(0, len(a) - 1, min(len(a), _PAIRS)).astype(int)
-    tried = []
+    tried: list[tuple[float, int, int, Array]] = []
     for i, k in zip(a[some].tolist(), b[some].tolist(), strict=True):
         first = _camera_basis(P[i])
         for f in _FOCAL:

@@ -104,6 +104,11 @@ class BundleProblem:
 
     def linearize(self, state: BundleState) -> Linearized:
         """Return the normal equations."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            # A start with a point in a focal plane has no finite blocks; its cost stops the run.
+            return self._linearized(state)
+
+    def _linearized(self, state: BundleState) -> Linearized:
         A = -state.root * state.J_P
         B = -state.root * state.J_Q
         r = state.root * state.r

@@ -190,9 +190,13 @@ class Reconstruction:
         object.__setattr__(self, "Q", _homogeneous("Q", self.Q, (4,)))
 
     def project(self, tracks: Tracks) -> Array:
-        """Return the predicted pixels of all observations, shape (N, 2), in the tracks' order."""
+        """Return the predicted pixels of all observations, shape (N, 2), in the tracks' order.
+
+        Infinite or NaN for points in a camera's focal plane.
+        """
         h = np.einsum("nij,nj->ni", self.P[tracks.view], self.Q[tracks.point])
-        return np.asarray(h[:, :2] / h[:, 2:])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(h[:, :2] / h[:, 2:])
 
     def rms_px(self, tracks: Tracks) -> float:
         """Return sqrt(sum of squared residual coordinates / (2 N))."""

@@ -24,19 +24,20 @@ Array = NDArray[np.float64]
 
 _WIDTH = 11.0  # inches
 _CAMERA = "#e07a1f"
-_PYRAMID = 0.35  # height of a camera, in usual distances of a point from the middle
+_PYRAMID = (0.1, 0.35)  # height of a camera, in usual distances of a point from the middle
 _COLOURS = (
-    *("#6c757d", "#2a6f97", "#61a5c2", "#2d6a4f", "#74c69d"),
-    *("#b5838d", "#7b2cbf", "#e07a1f", "#a47148", "#c1121f"),
+    *("#6c757d", "#2a6f97", "#61a5c2", "#2d6a4f", "#74c69d", "#b5838d"),
+    *("#7b2cbf", "#e07a1f", "#a47148", "#212529"),
 )
-_MARKERS = "ovs^Dv<>Po"
+_MARKERS = "vs^D<>PXdp"
 
 
 def plot_bundle(result: BundleResult, tracks: Tracks, title: str = "") -> Figure:
     """Show points and cameras from two sides, the residuals, and the convergence.
 
     Above the scene in a basis in which it looks plausible (see `display`): that is no calibration,
-    and nothing can be measured in it. Cameras are pyramids; colour is distance from the cameras.
+    and nothing can be measured in it. Cameras are pyramids, drawn nearer where they
+    are far away; colour is depth.
     Below the residual coordinates with the Gaussian of deviation 1.48 median |r|, and the cost of
     each evaluation, less the lowest one.
 
@@ -97,7 +98,7 @@ def plot_comparison(comparison: Comparison, title: str = "") -> Figure:
         If Matplotlib is not installed.
     """
     figure = new_figure(_WIDTH, 6.0)
-    heading(figure, title or "Convergence of the methods")
+    heading(figure, "Convergence of the methods" + (f": {title}" if title else ""))
     axes = figure.add_subplot()
     best = min(row.cost for row in comparison.rows)
     # Below this the costs of two converged runs do not differ by anything but where they stopped.
@@ -112,8 +113,8 @@ def plot_comparison(comparison: Comparison, title: str = "") -> Figure:
         axes.plot(
             np.arange(1, len(above) + 1),
             above,
-            color=_COLOURS[k % len(_COLOURS)],
-            marker=_MARKERS[k % len(_MARKERS)],
+            color=RED if strong else _COLOURS[k % len(_COLOURS)],
+            marker="o" if strong else _MARKERS[k % len(_MARKERS)],
             ms=6 if strong else 4,
             lw=2.6 if strong else 1.3,
             markevery=max(1, len(above) // 12),
@@ -124,7 +125,10 @@ def plot_comparison(comparison: Comparison, title: str = "") -> Figure:
     axes.set(yscale="log", xlabel="evaluations of the cost")
     axes.set(ylabel="lowest cost so far, above the best (px\N{SUPERSCRIPT TWO})")
     if slowest > 30:
+        ticks = [tick for tick in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000) if tick <= slowest]
         axes.set(xscale="log")
+        axes.set_xticks(ticks, list(map(str, ticks)))
+        axes.set_xticks([], minor=True)
     finish(axes, f"best cost {best:.7g} px\N{SUPERSCRIPT TWO}")
     axes.legend(
         title="method: evaluations", loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False
@@ -137,12 +141,13 @@ def _draw_scene(axes: Axes, shown: Display, side: Array) -> None:
     points = shown.points[shown.shown]
     seen = points @ side.T
     order = np.argsort(-seen[:, 2])
-    axes.scatter(
-        *seen[order, :2].T, c=points[order, 1], cmap="viridis", s=_size(len(points)), lw=0.0
-    )
+    x, y, depth = *seen[order, :2].T, points[order, 1]
+    axes.scatter(x, y, c=depth, cmap="viridis", s=_size(len(points)), lw=0.0)
     axes.plot(*(shown.centres @ side.T)[:, :2].T, color=_CAMERA, lw=0.7, alpha=0.6)
+    steps = np.linalg.norm(np.diff(shown.centres, axis=0), axis=1)
+    height = float(np.clip(np.median(steps), *_PYRAMID))
     for centre, corners in zip(shown.centres, shown.corners, strict=True):
-        rim = centre + _PYRAMID * corners
+        rim = centre + height * corners
         line = np.stack([rim[0], centre, rim[1], rim[0], rim[3], centre, rim[2], rim[3]])
         axes.plot(*(line @ side.T)[:, :2].T, color=_CAMERA, lw=0.9)
         axes.plot(*(rim[1:3] @ side.T)[:, :2].T, color=_CAMERA, lw=0.9)

@@ -119,7 +119,7 @@ def dampings_section(study: Study) -> Section:
             "LM's first lambda is large against the points, and its first steps only wait for "
             "lambda to fall by a factor of 10 each; SEBER's is relative to each entry. With a "
             f"smaller first lambda SEBER's lead is gone ({numbers}). Coordinates in [-1, 1], as "
-            "the paper's, change the counts less than that. Far from the scene, where the cost is "
+            "the paper's, change its counts less than that. Far from the scene, where the cost is "
             "nearly flat in some directions, SEBER does not hold points back from running off "
             "along them and loses its lead: see the evaluations of Figure 1 (b). The paper gives "
             f"no first lambda. xi = {_XI:g} here; factor 10 up and down.",

@@ -31,6 +31,10 @@ Array = NDArray[np.float64]
 #: convergence is quadratic, so that the error left is the square of it.
 _SETTLED = 1e-7
 
+#: Squared derivative of a distance by F (conditioned, of unit size) beyond which the match counts
+#: as lying on both epipoles, where the distance has no derivative; it is then left out of the step.
+_SINGULAR = 1e14
+
 _UPPER = np.triu_indices(9)
 
 
@@ -140,6 +144,12 @@ class Reprojection:
         matches = (self.q1, self.q2, distances.multiplier, weight)
         g, packed = self.kernels.reprojection_gauss_newton(*distances.frame, *matches)
         N = _unpack(packed)
+        if not np.trace(N) < _SINGULAR and weight.any():
+            rows = self.corrected(distances)[2]
+            smooth = np.sum(rows**2, axis=0) < _SINGULAR
+            if not smooth.all():
+                rest = None if curvature is None else curvature * smooth
+                return self.normal(F, distances, weight * smooth, rest)
         H = N
         if curvature is not None:
             _, packed = self.kernels.reprojection_newton(*distances.frame, *matches, curvature)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
-from epigauge._arguments import as_fundamental, as_matches
+from epigauge._arguments import as_fundamental, as_matches, as_real
 from epigauge.errors import ArgumentError
 from epigauge.two_view.conditioning import Conditioning, condition
 from epigauge.two_view.criteria import Reprojection
@@ -41,7 +41,7 @@ def canonical_cameras(F: ArrayLike) -> tuple[Array, Array]:
     .. [BS04] A. Bartoli, P. Sturm, "Nonlinear estimation of the fundamental matrix with minimal
        parameters", PAMI 26(3), 2004, eqs. (4), (5).
     """
-    factors = factorize(_rank_two("F", F))
+    factors = factorize(_rank_two("F", as_fundamental(F, "F")))
     return np.eye(3, 4), np.asarray(kernels.table().canonical_camera(*factors))
 
 
@@ -82,10 +82,9 @@ def reprojection_distances(
     .. [1] R. Hartley, P. Sturm, "Triangulation", CVIU 68(2), 1997.
     """
     x1, x2 = as_matches(x1, x2, at_least=0)
-    F = _rank_two("F", F)
+    frame, F_inside, q1, q2 = _conditioned(F, x1, x2)
     if not len(x1):
         return np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2))
-    frame, F_inside, q1, q2 = _conditioned(F, x1, x2)
     reprojection = Reprojection(kernels.table(), q1, q2)
     feet = reprojection.evaluate(F_inside)
     q1_hat, q2_hat, _ = reprojection.corrected(feet)
@@ -114,14 +113,17 @@ def sampson_distances(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> Array:
         On bad shapes, NaN or infinity, or an F without a rank of 2.
     """
     x1, x2 = as_matches(x1, x2, at_least=0)
-    F = _rank_two("F", F)
+    frame, F_inside, q1, q2 = _conditioned(F, x1, x2)
     if not len(x1):
         return np.zeros(0)
-    frame, F_inside, q1, q2 = _conditioned(F, x1, x2)
+    table = kernels.table()
     with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0 on both epipoles
-        r, _ = kernels.table().sampson(F_inside, q1, q2)
-    finite = np.nan_to_num(r[0], nan=0.0, posinf=0.0, neginf=0.0)
-    return np.asarray(finite * frame.scale)
+        r, _ = table.sampson(F_inside, q1, q2)
+        C, terms = table.algebraic(F_inside, q1, q2)
+    # C is a sum of nine products; below their rounding it, and hence the distance, is zero.
+    size = np.abs(F_inside.ravel()) @ np.abs(terms[0])
+    distances = np.where(np.abs(C[0]) <= 8.0 * np.finfo(float).eps * size, 0.0, r[0])
+    return np.asarray(distances * frame.scale)
 
 
 def triangulate(P: ArrayLike, x: ArrayLike) -> Array:
@@ -150,10 +152,12 @@ def triangulate(P: ArrayLike, x: ArrayLike) -> Array:
     -----
     The matches are corrected to their foot points, whose rays meet exactly.
     """
-    cameras = np.asarray(P, dtype=np.float64)
-    if cameras.shape != (2, 3, 4) or not np.isfinite(cameras).all():
+    cameras = as_real("P", P, "two finite cameras, (2, 3, 4)")
+    if cameras.shape != (2, 3, 4):
         raise ArgumentError("P", f"has shape {cameras.shape}", "two finite cameras, (2, 3, 4)")
-    points = np.asarray(x)
+    if not np.isfinite(cameras).all():
+        raise ArgumentError("P", "is not finite", "two finite cameras, (2, 3, 4)")
+    points = as_real("x", x, "the two images' points, (2, m, 2)")
     if points.ndim != 3 or points.shape[0] != 2:
         raise ArgumentError("x", f"has shape {points.shape}", "the two images' points, (2, m, 2)")
     _, x1_hat, x2_hat = reprojection_distances(_fundamental(cameras), points[0], points[1])
@@ -176,17 +180,24 @@ def _fundamental(cameras: Array) -> Array:
     return F
 
 
-def _rank_two(name: str, F: ArrayLike) -> Array:
-    """Check F and lower its rank to 2."""
-    U, values, Vt = np.linalg.svd(as_fundamental(F, name))
+def _rank_two(name: str, F: Array) -> Array:
+    """Lower the rank of F to 2."""
+    U, values, Vt = np.linalg.svd(F)
     if values[1] <= np.finfo(float).eps * values[0]:
         raise ArgumentError(name, "has rank 1", "a fundamental matrix, of rank 2")
     return np.asarray((U[:, :2] * (values[:2] / values[0])) @ Vt[:2])
 
 
-def _conditioned(F: Array, x1: Array, x2: Array) -> tuple[Conditioning, Array, Array, Array]:
-    """Return conditioning, F and matches in conditioned coordinates."""
+def _conditioned(F: ArrayLike, x1: Array, x2: Array) -> tuple[Conditioning, Array, Array, Array]:
+    """Return conditioning, F of rank 2 and matches in conditioned coordinates."""
+    matrix = as_fundamental(F, "F")
+    values = np.linalg.svd(matrix, compute_uv=False)
+    if values[2] > 1e-8 * values[1]:  # not by rounding: the caller's own nearest matrix is meant
+        matrix = _rank_two("F", matrix)
+    if not len(x1):
+        return Conditioning(np.zeros(2), np.zeros(2), 1.0), _rank_two("F", matrix), x1.T, x2.T
     frame = condition(x1, x2)
     if frame.scale == 0.0:  # a single match, or all equal
         frame = Conditioning(frame.origin1, frame.origin2, 1.0)
-    return frame, frame.from_pixels(F), *frame.forward(x1, x2)
+    # Here, not in pixels, the singular values are comparable and no digits are lost.
+    return frame, _rank_two("F", frame.from_pixels(matrix)), *frame.forward(x1, x2)

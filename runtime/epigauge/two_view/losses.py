@@ -53,9 +53,10 @@ LOSSES: dict[str, Callable[[Array], _Values]] = {
 }
 
 
-#: Scale over the standard deviation of the noise at which a loss keeps about 95 % efficiency on
-#: clean Gaussian data (the truncated one: three standard deviations).
-EFFICIENT = {"huber": 1.345, "soft_l1": 1.5, "cauchy": 2.385, "truncated": 3.0}
+#: Scale over the standard deviation of the noise at which a loss keeps 95 % efficiency on clean
+#: Gaussian data, from E[psi x]^2 / E[psi^2] with psi = rho'(x^2) x; the truncated one, at three
+#: standard deviations, keeps 97 %.
+EFFICIENT = {"huber": 1.345, "soft_l1": 1.287, "cauchy": 2.385, "truncated": 3.0}
 
 
 @dataclass(frozen=True)

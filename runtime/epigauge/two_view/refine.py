@@ -207,7 +207,7 @@ def refine_fundamental(
 
 def _parts(fix: str | Sequence[str]) -> tuple[str, ...]:
     """Return the names of the parts to freeze, each once."""
-    names = (fix,) if isinstance(fix, str) else tuple(fix)
+    names = (fix,) if isinstance(fix, str) or not isinstance(fix, Sequence) else tuple(fix)
     return tuple(dict.fromkeys(as_choice("fix", name, Ortho.parts) for name in names))
 
 
@@ -350,7 +350,7 @@ def _result(
         rank=uncertainty.rank,
         condition=uncertainty.condition,
         noise_px=noise_px,
-        rms_px=float(frame.scale * np.sqrt(np.mean(squared) / 4.0)),
+        rms_px=float(frame.scale * np.sqrt(np.mean(squared[weights > 0.0]) / 4.0)),
         loss_scale_px=solution.loss_scale_px,
         x=F.ravel(),
         cost=outcome.state.cost * frame.scale**2,

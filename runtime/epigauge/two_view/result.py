@@ -49,7 +49,8 @@ class FundamentalResult:
     noise_px : float
         Standard deviation of a coordinate that the covariance was computed with.
     rms_px : float
-        sqrt(sum of squared residual coordinates / (4 m)), whatever criterion and loss.
+        sqrt(sum of squared residual coordinates / (4 m)), whatever criterion and loss, over the
+        matches of positive weight.
     loss_scale_px : float
         Scale of the robust loss, given or estimated; 0 for the linear loss.
     x : ndarray, shape (9,)

@@ -46,6 +46,9 @@ REDUNDANT = ("parfree", "free", "normalized")
 _SCALE_SETTLED = 1e-3
 _SCALE_ROUNDS = 10
 
+#: Joint solutions whose cost exceeds that of the best points by more than this did not converge.
+_SETTLED = 1e-6
+
 
 @dataclass(frozen=True)
 class Options:
@@ -218,7 +221,22 @@ def _minimize_once(
         motion = chart.start(F)
     else:
         motion = outcome.state.motion
-    return Solution(chart.fundamental(motion), chart, motion, outcome, scale_px)
+    F = chart.fundamental(motion)
+    if outcome.status > 0 and not isinstance(problem, EliminatedProblem):
+        outcome = replace(outcome, status=_settled(matches, F, loss, outcome))
+    return Solution(F, chart, motion, outcome, scale_px)
+
+
+def _settled(matches: Matches, F: Array, loss: Loss, outcome: lm.Outcome[Any]) -> int:
+    """Return the status, corrected where points are left far from the best ones for this F.
+
+    A point that crosses a focal plane or starts near an epipole can hold up all the others; the
+    steps, though short, are then no sign of convergence.
+    """
+    rho, _, _ = loss(matches.reprojection().evaluate(F).squared)
+    lowest = 0.5 * float(np.sum(matches.weights * rho))
+    rounding = 1e-24 * float(np.sum(matches.weights))
+    return outcome.status if outcome.state.cost <= lowest * (1.0 + _SETTLED) + rounding else -4
 
 
 def _chart(matches: Matches, options: Options, start: Array) -> Parameterization:

@@ -1,0 +1,110 @@
+"""``epigauge compare``: the methods side by side on one file of tracks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+import epigauge as eg
+from epigauge.cli._common import DONE, NOT_CONVERGED, Json, console, shown, write_json
+from epigauge.cli.bundle import (
+    Backend,
+    Clean,
+    MaxIter,
+    Start,
+    TracksFile,
+    first_reconstruction,
+)
+from epigauge.io import load_track_file
+from epigauge.io._common import check_suffix
+from epigauge.multi_view.compare import Comparison
+from epigauge.multi_view.strategies import STRATEGIES
+
+
+def compare(
+    tracks: TracksFile,
+    methods: Annotated[
+        str, typer.Option(help="all, or several of: " + ", ".join(STRATEGIES) + ".")
+    ] = "all",
+    clean: Clean = False,
+    max_iter: MaxIter = 100,
+    start: Start = None,
+    backend: Backend = None,
+    plot: Annotated[Path | None, typer.Option(help="Draw the convergence: PNG or SVG.")] = None,
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="Write the table to stdout as Markdown.")
+    ] = False,
+    json: Json = False,
+) -> int:
+    """Adjust the same tracks from the same start by several methods.
+
+    Exit code 1 if the default method or, without it, none converged.
+    """
+    if plot is not None:
+        check_suffix(plot, ".png", ".svg")
+    out = console()
+    file = load_track_file(tracks, clean)
+    chosen = methods if methods == "all" else [name.strip() for name in methods.split(",")]
+    with out.status("first reconstruction") as status:
+        comparison = eg.compare(
+            file.tracks,
+            chosen,
+            first_reconstruction(file, tracks, start, backend),
+            on_method=status.update,
+            max_iter=max_iter,
+            backend=backend,
+        )
+    if plot is not None:
+        from epigauge.plots import save_figure
+
+        save_figure(comparison.plot(tracks.name), plot)
+    if json:
+        write_json(
+            {
+                "source": str(tracks),
+                "start_rms_px": comparison.start_rms_px,
+                "rows": comparison.rows,
+            }
+        )
+    elif markdown:
+        typer.echo(comparison.to_markdown(), nl=False)
+    else:
+        print_table(out, comparison, f"{shown(tracks)}: {file.tracks}")
+    return exit_code(comparison)
+
+
+def print_table(out: Console, comparison: Comparison, title: str) -> None:
+    """Show the rows to people, the default method in bold and what did not converge in red."""
+    table = Table(
+        title=escape(title),
+        title_justify="left",
+        caption=f"start: RMS {comparison.start_rms_px:.4f} px; evals: evaluations of the cost",
+        caption_justify="left",
+    )
+    table.add_column("method")
+    for heading in ("evals", "RMS px", "cost px^2", "seconds"):
+        table.add_column(heading, justify="right")
+    table.add_column("end")
+    for row in comparison.rows:
+        style = "bold" if row.method == "covariant" else None
+        table.add_row(
+            row.method,
+            str(row.nfev),
+            f"{row.rms_px:.6f}",
+            f"{row.cost:.8g}",
+            f"{row.seconds:.2f}",
+            "converged" if row.success else escape(row.message),
+            style=style if row.success else "red",
+        )
+    out.print(table)
+
+
+def exit_code(comparison: Comparison) -> int:
+    """Return whether the default method, or else any, converged."""
+    counted = [row for row in comparison.rows if row.method == "covariant"] or comparison.rows
+    return DONE if any(row.success for row in counted) else NOT_CONVERGED

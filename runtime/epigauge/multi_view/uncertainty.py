@@ -1,0 +1,602 @@
+"""Uncertainty of a reconstruction to first order: in the free gauge, in any other, and of images.
+
+The normal matrix N is singular along the gauge freedom. Every generalised inverse X of N gives, by
+the projector S of a gauge (the S-transformation of geodesy), the same covariance S X S^T there;
+what the observations alone determine, such as projected points, has the same covariance in every
+gauge. X is found once, from the reduced system of the cameras, in the basis and the parameters in
+which N is best conditioned; no matrix of all parameters is formed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge import kernels
+from epigauge._arguments import as_positive
+from epigauge.errors import ArgumentError
+from epigauge.multi_view.dampings import Covariant
+from epigauge.multi_view.gauge import (
+    Gauge,
+    five_points,
+    identity,
+    normalized,
+    reference_camera,
+    two_cameras,
+)
+from epigauge.multi_view.initialize import Frame
+from epigauge.multi_view.problem import BundleProblem, BundleState
+from epigauge.multi_view.system import BundleSystem, Layout
+from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.two_view.free import scatter_constraints
+from epigauge.two_view.losses import Loss
+
+__all__ = ["Constraints", "ConstraintsOfGauge", "Projector", "ReconstructionCovariance"]
+__all__ += ["covariance"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: Most parameters of which `ReconstructionCovariance.dense` makes one matrix.
+_DENSE = 5000
+
+
+@dataclass(frozen=True)
+class Constraints:
+    """First-order conditions on a small motion (dP, dQ) that stays in a gauge.
+
+    Attributes
+    ----------
+    cameras : ndarray, shape (n, 12)
+        One condition a camera, ``cameras[i] @ vect(dP_i) = 0``, that fixes its scale.
+    points : ndarray, shape (m, 4)
+        One condition a point, ``points[j] @ dQ_j = 0``, that fixes its scale.
+    basis : ndarray, shape (k, 12 n + 4 m)
+        Conditions on all, ``basis @ (vect(dP), dQ) = 0``, that fix the basis; fewer than fifteen
+        independent ones leave a freedom, in which the motion is of least norm.
+    """
+
+    cameras: Array
+    points: Array
+    basis: Array
+
+
+@runtime_checkable
+class ConstraintsOfGauge(Protocol):
+    """A gauge of your own: offer this method, and `covariance` can use it."""
+
+    def constraints(self, P: Array, Q: Array) -> Constraints:
+        """Return the conditions at cameras (n, 3, 4) and points (m, 4) that are in the gauge."""
+
+
+@dataclass(frozen=True)
+class Projector:
+    """The S-transformation S: takes a small motion to the equivalent one that stays in the gauge.
+
+    S = (I - H K) L with L the scales' part and H K that of the fifteen changes of basis. S G = 0
+    for the directions G of the gauge freedom, S S = S, and N S = N.
+
+    Attributes
+    ----------
+    p, q : ndarray, shape (n, 12), (m, 4)
+        Directions of the scales of cameras and points.
+    c, d : ndarray, shape (n, 12), (m, 4)
+        Conditions on them, with c . p = 1 and d . q = 1.
+    H, K : ndarray, shape (12 n + 4 m, 15), (15, 12 n + 4 m)
+        Changes of basis and conditions on them, K H = I; K includes L.
+    """
+
+    p: Array
+    q: Array
+    c: Array
+    d: Array
+    H: Array
+    K: Array
+
+    def apply(self, motion: Array) -> Array:
+        """Return S times a motion, shape (12 n + 4 m,) or (12 n + 4 m, r)."""
+        return self._scaled(motion) - self.H @ (self.K @ motion)
+
+    def _scaled(self, motion: Array) -> Array:
+        """Return L times a motion."""
+        size = self.p.size
+        x = motion[:size].reshape(*self.p.shape, -1)
+        y = motion[size:].reshape(*self.q.shape, -1)
+        x = x - self.p[:, :, None] * np.einsum("ni,nir->nr", self.c, x)[:, None]
+        y = y - self.q[:, :, None] * np.einsum("ni,nir->nr", self.d, y)[:, None]
+        parts = x.reshape(size, -1), y.reshape(self.q.size, -1)
+        return np.concatenate(parts).reshape(motion.shape)
+
+    def locals(self) -> tuple[Array, Array]:
+        """Return the blocks of L, (n, 12, 12) and (m, 4, 4)."""
+        cameras = np.eye(12) - self.p[:, :, None] * self.c[:, None, :]
+        return cameras, np.eye(4) - self.q[:, :, None] * self.d[:, None, :]
+
+
+@dataclass(frozen=True, eq=False)
+class ReconstructionCovariance:
+    """Covariances of cameras, points and projected points, to first order in the noise.
+
+    Attributes
+    ----------
+    reconstruction : Reconstruction
+        The estimate, in the gauge.
+    noise_px : float
+        Standard deviation of an image coordinate of weight one, in pixels: given or estimated.
+    projector : Projector
+        What takes a motion of the parameters to the gauge: applied on both sides, it takes the
+        covariance in any gauge, brought to this basis and these scales, to the one here.
+    """
+
+    reconstruction: Reconstruction
+    noise_px: float
+    projector: Projector
+    _inverse: _Inverse
+    _maps: tuple[Array, Array]
+
+    def in_gauge(self, gauge: Gauge) -> ReconstructionCovariance:
+        """Return the covariance in another gauge; nothing large is computed again.
+
+        Parameters
+        ----------
+        gauge : Gauge
+            Where to; `identity` gives the free gauge in the basis of this reconstruction.
+
+        Returns
+        -------
+        ReconstructionCovariance
+            In the gauge, with the reconstruction moved there.
+        """
+        P, Q = self.reconstruction.P, self.reconstruction.Q
+        there = gauge.transformation(P, Q)
+        moved = there.apply(P, Q)
+        cameras, points = there.blocks()
+        maps = (cameras @ self._maps[0], points @ self._maps[1])
+        projector = _projector(gauge, *moved)
+        return replace(self, reconstruction=Reconstruction(*moved), projector=projector, _maps=maps)
+
+    @property
+    def cameras(self) -> Array:
+        """Return the covariance of vect(P_i) for each camera, shape (n, 12, 12)."""
+        n = len(self.reconstruction.P)
+        full = self.all_cameras.reshape(n, 12, n, 12)
+        return full[np.arange(n), :, np.arange(n)]
+
+    @cached_property
+    def all_cameras(self) -> Array:
+        """Return the covariance of all cameras together, shape (12 n, 12 n)."""
+        size = self.reconstruction.P.size
+        blocks = self.projector.locals()[0] @ self._maps[0]
+        n = len(blocks)
+        X = self._inverse.cameras.reshape(n, 12, n, 12)
+        X = np.einsum("aij,ajbk->aibk", blocks, X, optimize=True)
+        X = np.einsum("aibk,blk->aibl", X, blocks, optimize=True).reshape(size, size)
+        H, (T, R) = self.projector.H[:size], self._coupled
+        found = X - H @ T[:, :size] - T[:, :size].T @ H.T + H @ R @ H.T
+        return np.asarray(0.5 * self._variance * (found + found.T))
+
+    @cached_property
+    def points(self) -> Array:
+        """Return the covariance of each Q_j, shape (m, 4, 4)."""
+        size = self.reconstruction.P.size
+        blocks = self.projector.locals()[1] @ self._maps[1]
+        X = blocks @ self._inverse.points @ np.swapaxes(blocks, 1, 2)
+        H = self.projector.H[size:].reshape(-1, 4, 15)
+        T, R = self._coupled
+        HT = H @ T[:, size:].reshape(15, -1, 4).transpose(1, 0, 2)
+        found = X - HT - np.swapaxes(HT, 1, 2) + H @ R @ np.swapaxes(H, 1, 2)
+        return np.asarray(0.5 * self._variance * (found + np.swapaxes(found, 1, 2)))
+
+    @cached_property
+    def projections(self) -> Array:
+        """Return the covariance of each projected point in px^2, in the tracks' order, (N, 2, 2).
+
+        It is the same in every gauge. The residual's own is weight^-1 noise_px^2 I less this.
+        """
+        return np.asarray(self.noise_px**2 * self._inverse.observed)
+
+    def of_projections(self, view: ArrayLike, point: ArrayLike) -> Array:
+        """Return the covariance of points projected to views where they need not be observed.
+
+        Parameters
+        ----------
+        view, point : array_like of int, shape (k,)
+            Which.
+
+        Returns
+        -------
+        ndarray, shape (k, 2, 2)
+            In px^2, the same in every gauge.
+        """
+        views, points = np.asarray(view), np.asarray(point)
+        for name, indices, count in (
+            ("view", views, len(self.reconstruction.P)),
+            ("point", points, len(self.reconstruction.Q)),
+        ):
+            if indices.ndim != 1 or indices.dtype.kind not in "iu" or len(views) != len(points):
+                raise ArgumentError(name, f"is {indices.dtype} {indices.shape}", "integers, (k,)")
+            if len(indices) and not (0 <= indices.min() and indices.max() < count):
+                raise ArgumentError(name, "is out of range", f"indices from 0 below {count}")
+        return np.asarray(self.noise_px**2 * self._inverse.projected(views, points))
+
+    def dense(self) -> Array:
+        """Return the covariance of all parameters: cameras, then points, row by row.
+
+        Returns
+        -------
+        ndarray, shape (12 n + 4 m, 12 n + 4 m)
+            Of small problems only.
+
+        Raises
+        ------
+        ArgumentError
+            Beyond 5000 parameters; ask for `cameras`, `points` or `projections` instead.
+        """
+        size = self.reconstruction.P.size + self.reconstruction.Q.size
+        if size > _DENSE:
+            raise ArgumentError("covariance", f"has {size} parameters", f"at most {_DENSE}")
+        half = self.projector.apply(_mapped(self._maps, np.eye(size)))
+        found = half @ self._inverse.apply(half.T)
+        return np.asarray(0.5 * self._variance * (found + found.T))
+
+    @property
+    def _variance(self) -> float:
+        """Return the variance in the units of the image that the inverse was made in."""
+        return (self.noise_px / self._inverse.scale) ** 2
+
+    @cached_property
+    def _coupled(self) -> tuple[Array, Array]:
+        """K X L^T (15, 12 n + 4 m) and K X K^T (15, 15), X a generalised inverse in this basis."""
+        K = self.projector.K
+        swapped = (np.swapaxes(self._maps[0], 1, 2), np.swapaxes(self._maps[1], 1, 2))
+        X = _mapped(self._maps, self._inverse.apply(_mapped(swapped, K.T)))
+        return self.projector._scaled(X).T, K @ X
+
+
+def covariance(
+    tracks: Tracks,
+    reconstruction: Reconstruction,
+    gauge: Gauge | None = None,
+    noise_px: float | None = None,
+    *,
+    backend: str | None = None,
+) -> ReconstructionCovariance:
+    """Return the covariance of an adjusted reconstruction, in any gauge.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Observations that the reconstruction was adjusted to (with their weights, linear loss).
+    reconstruction : Reconstruction
+        Cameras and points at the minimum.
+    gauge : Gauge, optional
+        The reconstruction is moved there, and its covariance is that of the estimate expressed in
+        that gauge. By default the free gauge of the reconstruction as it is: the pseudo-inverse
+        of the normal matrix, of least trace. What a gauge leaves open (an orthonormal change of
+        basis in the normalised one) is treated like that, too.
+    noise_px : float, optional
+        Standard deviation of an image coordinate of weight one. By default estimated from the
+        residuals: sqrt(sum of weighted squares / (2 N - 11 n - 3 m + 15)).
+    backend : {"c", "numpy", "casadi"}, optional
+        Where the formulas are computed.
+
+    Returns
+    -------
+    ReconstructionCovariance
+        Covariances of cameras, points and projected points, and the way to other gauges.
+
+    Raises
+    ------
+    ArgumentError
+        If the reconstruction has another size, there is nothing to estimate the noise from, the
+        observations do not determine the reconstruction, or the gauge is not one of `eg.gauge`
+        and has no method `constraints`.
+
+    Notes
+    -----
+    The reduced system of the cameras is dense, (12 n)^2.
+
+    References
+    ----------
+    .. [1] K. Kanatani, D. D. Morris, "Gauges and gauge transformations for uncertainty description
+       of geometric structure with indeterminacy", IEEE Trans. Inf. Theory 47(5), 2001.
+    """
+    P, Q = reconstruction.P, reconstruction.Q
+    n, m = len(P), len(Q)
+    if (n, m) != (tracks.n_views, tracks.n_points):
+        raise ArgumentError(
+            "reconstruction",
+            f"has {n} cameras and {m} points",
+            f"{tracks.n_views} and {tracks.n_points}, as the tracks",
+        )
+    frame = Frame.of(tracks)
+    home = normalized().transformation(frame.cameras_in(P), Q)
+    layout = Layout(tracks.view, tracks.point, n, m)
+    problem = BundleProblem(
+        kernels.table(backend),
+        layout,
+        frame.conditioned(tracks),
+        np.asarray(tracks.weights),
+        Loss(),
+    )
+    state = problem.evaluate(home.apply(frame.cameras_in(P), Q))
+    if noise_px is None:
+        redundancy = 2 * int(np.count_nonzero(tracks.weights)) - 11 * n - 3 * m + 15
+        if redundancy <= 0:
+            raise ArgumentError("noise_px", "is not given", "a number: nothing is redundant")
+        noise_px = frame.scale * float(np.sqrt(2.0 * state.cost / redundancy))
+    else:
+        noise_px = as_positive("noise_px", noise_px)
+    inverse = _Inverse.of(problem, state, frame.scale)
+    # From whitened parameters at home to the reconstruction as given, in pixels.
+    cameras, points = home.inverse().blocks()
+    pixels = np.zeros((n, 3, 3))
+    pixels[:, [0, 1], [0, 1]] = frame.scale
+    pixels[:, :2, 2], pixels[:, 2, 2] = frame.origins, 1.0
+    out = np.einsum("nij,kl->nikjl", pixels, np.eye(4)).reshape(n, 12, 12)
+    maps = (out @ cameras @ inverse.whitening[0], points @ inverse.whitening[1])
+    free = ReconstructionCovariance(
+        reconstruction, noise_px, _projector(identity(), P, Q), inverse, maps
+    )
+    return free if gauge is None else free.in_gauge(gauge)
+
+
+@dataclass(frozen=True)
+class _Inverse:
+    """A generalised inverse X of N, in parameters in which W of the covariant damping is one.
+
+    X = (N + A A^T)^-1 with A along the scales and, for the cameras, the changes of basis: the
+    reduced matrix of the cameras is definite, and N X N = N.
+
+    Attributes
+    ----------
+    layout : Layout
+        The observations.
+    cameras : ndarray, shape (12 n, 12 n)
+        The cameras' part of X.
+    V_inverse : ndarray, shape (m, 4, 4)
+        Inverse point blocks.
+    W, Y : ndarray, shape (N, 12, 4)
+        Coupling of each observation, and that times V^-1.
+    whitening : tuple of ndarray, shape (n, 12, 12), (m, 4, 4)
+        Blocks from these parameters to those of the state.
+    state : BundleState
+        Where N was made, in conditioned coordinates.
+    problem : BundleProblem
+        What made it.
+    scale : float
+        Pixels a unit of the image.
+    """
+
+    layout: Layout
+    cameras: Array
+    V_inverse: Array
+    W: Array
+    Y: Array
+    whitening: tuple[Array, Array]
+    state: BundleState
+    problem: BundleProblem
+    scale: float
+
+    @staticmethod
+    def of(problem: BundleProblem, state: BundleState, scale: float) -> _Inverse:
+        """Invert the normal equations at a state."""
+        try:
+            system = problem.linearize(state)
+            roots = [np.swapaxes(np.linalg.cholesky(W), 1, 2) for W in Covariant().matrix(system)]
+            whitening = (np.asarray(np.linalg.inv(roots[0])), np.asarray(np.linalg.inv(roots[1])))
+            white: BundleSystem = system.transformed(*whitening)
+            p, q, G = _freedom(problem.kernels, state.P, state.Q, (roots[0], roots[1]))
+            white = white.damped(p[:, :, None] * p[:, None, :], q[:, :, None] * q[:, None, :])
+            moves = G[: p.size]
+            V_inverse = np.asarray(np.linalg.inv(white.V))
+            reduced = white._reduced_matrix() + moves @ moves.T
+            values = np.linalg.eigvalsh(reduced)
+            if not values[0] > 1e-14 * values[-1]:
+                raise np.linalg.LinAlgError
+            cameras = np.linalg.inv(reduced)
+        except np.linalg.LinAlgError:
+            raise ArgumentError(
+                "reconstruction",
+                "is not determined by the tracks (singular normal equations)",
+                "cameras and points in general position, at a minimum",
+            ) from None
+        Y = white.W @ V_inverse[problem.layout.point]
+        return _Inverse(
+            problem.layout,
+            0.5 * (cameras + cameras.T),
+            V_inverse,
+            white.W,
+            Y,
+            whitening,
+            state,
+            problem,
+            scale,
+        )
+
+    def apply(self, vectors: Array) -> Array:
+        """Return X times vectors (12 n + 4 m, r)."""
+        size, layout = len(self.cameras), self.layout
+        points = vectors[size:].reshape(layout.n_points, 4, -1)
+        coupled = layout.sum_views(self.Y @ points[layout.point])
+        x = self.cameras @ (vectors[:size] - coupled.reshape(size, -1))
+        back = np.swapaxes(self.W, 1, 2) @ x.reshape(layout.n_views, 12, -1)[layout.view]
+        y = self.V_inverse @ (points - layout.sum_points(back))
+        return np.concatenate([x, y.reshape(len(vectors) - size, -1)])
+
+    @cached_property
+    def points(self) -> Array:
+        """Return the points' diagonal blocks of X, (m, 4, 4)."""
+        return self._points_and_couplings[0]
+
+    @cached_property
+    def observed(self) -> Array:
+        """Return J X J^T of each observation, (N, 2, 2)."""
+        layout = self.layout
+        points, couplings = self._points_and_couplings
+        n = layout.n_views
+        blocks = self.cameras.reshape(n, 12, n, 12)[np.arange(n), :, np.arange(n)]
+        return self._propagated(
+            layout.view, layout.point, blocks[layout.view], couplings, points[layout.point]
+        )
+
+    def projected(self, views: Indices, points: Indices) -> Array:
+        """Return J X J^T of any points in any views, (k, 2, 2)."""
+        n = self.layout.n_views
+        blocks = self.cameras.reshape(n, 12, n, 12)
+        couplings = np.empty((len(views), 12, 4))
+        for k, (i, j) in enumerate(zip(views, points, strict=True)):
+            rows = slice(self.layout.first[j], self.layout.first[j + 1])
+            Y = self.Y[rows].reshape(-1, 4)
+            couplings[k] = -blocks[i][:, self.layout.view[rows]].reshape(12, -1) @ Y
+        return self._propagated(
+            views, points, blocks[views, :, views], couplings, self.points[points]
+        )
+
+    @cached_property
+    def _points_and_couplings(self) -> tuple[Array, Array]:
+        """Return point blocks of X, and its block (camera, point) of each observation."""
+        layout, n = self.layout, self.layout.n_views
+        blocks = self.cameras.reshape(n, 12, n, 12)
+        points, couplings = self.V_inverse.copy(), np.empty_like(self.Y)
+        for j in range(layout.n_points):
+            rows = slice(layout.first[j], layout.first[j + 1])
+            views = layout.view[rows]
+            among = blocks[views[:, None], :, views[None, :], :]
+            size = 12 * len(views)
+            Y = self.Y[rows].reshape(size, 4)
+            XY = among.transpose(0, 2, 1, 3).reshape(size, size) @ Y
+            points[j] += Y.T @ XY
+            couplings[rows] = -XY.reshape(-1, 12, 4)
+        return points, couplings
+
+    def _propagated(
+        self, views: Indices, points: Indices, X_ii: Array, X_ij: Array, X_jj: Array
+    ) -> Array:
+        """Return J X J^T of points in views from the blocks of X."""
+        state = self.state
+        P, Q = state.P.transpose(1, 2, 0)[:, :, views], state.Q.T[:, points]
+        _, J_P, J_Q, _ = self.problem.kernels.project(
+            np.ascontiguousarray(P), np.ascontiguousarray(Q)
+        )
+        J_camera = J_P.transpose(2, 0, 1) @ self.whitening[0][views]
+        J_point = J_Q.transpose(2, 0, 1) @ self.whitening[1][points]
+        mixed = J_camera @ X_ij @ np.swapaxes(J_point, 1, 2)
+        found = J_camera @ X_ii @ np.swapaxes(J_camera, 1, 2)
+        found = found + J_point @ X_jj @ np.swapaxes(J_point, 1, 2)
+        return np.asarray(found + mixed + np.swapaxes(mixed, 1, 2))
+
+
+def _freedom(
+    table: kernels.Table, P: Array, Q: Array, maps: tuple[Array, Array]
+) -> tuple[Array, Array, Array]:
+    """Return unit directions of the scales, and an orthonormal basis of the changes beside them.
+
+    `maps` takes changes of (P, Q) to the parameters meant.
+    """
+    p = np.einsum("nij,nj->ni", maps[0], P.reshape(-1, 12))
+    q = np.einsum("nij,nj->ni", maps[1], Q)
+    p, q = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (p, q))
+    cameras = maps[0] @ table.camera_generators(P.transpose(1, 2, 0)).transpose(2, 0, 1)
+    points = maps[1] @ table.point_generators(Q.T).transpose(2, 0, 1)
+    cameras = cameras - p[:, :, None] * np.einsum("ni,nik->nk", p, cameras)[:, None]
+    points = points - q[:, :, None] * np.einsum("ni,nik->nk", q, points)[:, None]
+    moves = np.concatenate([cameras.reshape(-1, 16), points.reshape(-1, 16)])
+    # The identity only changes scales: one of the sixteen columns is dependent.
+    return p, q, np.asarray(np.linalg.svd(moves, full_matrices=False)[0][:, :15])
+
+
+def _projector(gauge: Gauge, P: Array, Q: Array) -> Projector:
+    """Return the projector of a gauge at a reconstruction that is in it."""
+    n, m = len(P), len(Q)
+    fixed = _constraints(gauge, P, Q)
+    table = kernels.table()
+    ones = (np.broadcast_to(np.eye(12), (n, 12, 12)), np.broadcast_to(np.eye(4), (m, 4, 4)))
+    p, q, G = _freedom(table, P, Q, ones)
+    c = fixed.cameras / np.sum(fixed.cameras * p, axis=1, keepdims=True)
+    d = fixed.points / np.sum(fixed.points * q, axis=1, keepdims=True)
+    scales = Projector(p, q, c, d, np.zeros((G.shape[0], 0)), np.zeros((0, G.shape[0])))
+    G = scales._scaled(G)
+    rows = fixed.basis / np.linalg.norm(fixed.basis, axis=1, keepdims=True)
+    U, values, Vt = np.linalg.svd(rows @ G)
+    rank = int(np.count_nonzero(values > 1e-9 * values.max(initial=0.0)))
+    left = np.linalg.qr(G @ Vt[rank:].T)[0]
+    K = np.concatenate([U[:, :rank].T @ rows, left.T])
+    H = G @ np.linalg.inv(K @ G)
+    # K L, so that a motion need not be scaled first.
+    x, y = K[:, : p.size].reshape(15, n, 12), K[:, p.size :].reshape(15, m, 4)
+    x = x - np.einsum("rni,ni->rn", x, p)[:, :, None] * c
+    y = y - np.einsum("rni,ni->rn", y, q)[:, :, None] * d
+    K = np.concatenate([x.reshape(15, -1), y.reshape(15, -1)], axis=1)
+    return replace(scales, H=H, K=K)
+
+
+def _constraints(gauge: Gauge, P: Array, Q: Array) -> Constraints:
+    """Return the linearised conditions of a gauge at a reconstruction in it."""
+    cameras, points = P.reshape(-1, 12).copy(), Q.copy()
+    third = np.tile([0.0, 0.0, 1.0, 0.0], (len(Q), 1))
+    if isinstance(gauge, identity):
+        return Constraints(cameras, points, np.zeros((0, P.size + Q.size)))
+    if isinstance(gauge, reference_camera):
+        rows = _fixed(P, Q, cameras=[gauge.camera])
+        along = np.zeros((4, *Q.shape))
+        for k in range(3):  # c is orthogonal to a, b and 1
+            along[k, :, 3] += Q[:, k]
+            along[k, :, k] += Q[:, 3]
+        along[3, :, 3] = Q[:, 3]  # and of unit mean square
+        basis = np.concatenate([np.zeros((4, P.size)), along.reshape(4, -1)], axis=1)
+        return Constraints(cameras, third, np.concatenate([rows, basis]))
+    if isinstance(gauge, two_cameras):
+        H, e = P[gauge.second, :, :3], P[gauge.second, :, 3]
+        U, _, Vt = np.linalg.svd(H)
+        canonic = np.zeros((5, len(P), 3, 4))
+        for k in range(3):  # e^T H = 0
+            canonic[k, gauge.second, :, k] = e
+            canonic[k, gauge.second, :, 3] = H[:, k]
+        canonic[3, gauge.second, :, :3] = np.outer(U[:, 0], Vt[0])  # |H| = 1
+        canonic[4, gauge.second, :, 3] = e  # |e| = 1
+        cameras[gauge.second] = canonic[4, gauge.second].ravel()
+        basis = np.concatenate([canonic[:4].reshape(4, -1), np.zeros((4, Q.size))], axis=1)
+        return Constraints(
+            cameras, third, np.concatenate([_fixed(P, Q, cameras=[gauge.first]), basis])
+        )
+    if isinstance(gauge, five_points):
+        chosen = gauge.choose(Q) if gauge.points is None else list(gauge.points)
+        return Constraints(cameras, points, _fixed(P, Q, points=chosen))
+    if isinstance(gauge, normalized):
+        scatter = scatter_constraints(Q).reshape(Q.size, -1).T
+        basis = np.concatenate([np.zeros((len(scatter), P.size)), scatter], axis=1)
+        return Constraints(cameras, points, basis)
+    if isinstance(gauge, ConstraintsOfGauge):
+        return gauge.constraints(P, Q)
+    raise ArgumentError(
+        "gauge", f"is {gauge!r}", "a gauge of eg.gauge, or one with a method constraints(P, Q)"
+    )
+
+
+def _fixed(P: Array, Q: Array, cameras: list[int] | None = None, points: ArrayLike = ()) -> Array:
+    """Return the conditions that some cameras or points change at most in scale."""
+    rows = []
+    for offset, vectors, chosen in (
+        (0, P.reshape(-1, 12), cameras or []),
+        (P.size, Q, np.asarray(points, dtype=np.intp)),
+    ):
+        width = vectors.shape[1]
+        for k in chosen:
+            across = np.linalg.svd(vectors[k][None])[2][1:]
+            block = np.zeros((width - 1, P.size + Q.size))
+            block[:, offset + width * k : offset + width * (k + 1)] = across
+            rows.append(block)
+    return np.concatenate(rows)
+
+
+def _mapped(blocks: tuple[Array, Array], vectors: Array) -> Array:
+    """Return block diagonal cameras and points times vectors (12 n + 4 m, r)."""
+    size = 12 * len(blocks[0])
+    x = blocks[0] @ vectors[:size].reshape(len(blocks[0]), 12, -1)
+    y = blocks[1] @ vectors[size:].reshape(len(blocks[1]), 4, -1)
+    return np.concatenate([x.reshape(size, -1), y.reshape(len(vectors) - size, -1)])

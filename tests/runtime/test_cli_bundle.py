@@ -1,0 +1,237 @@
+"""``epigauge bundle`` and ``epigauge compare``: data on stdout, text on stderr, exit codes."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import epigauge as eg
+import numpy as np
+import pytest
+
+pytest.importorskip("typer", reason="the command line needs typer")
+pytest.importorskip("rich", reason="the command line needs rich")
+
+from epigauge.__main__ import main
+from rich.console import Console
+
+SCENE = eg.multi_view_scene(n_points=30, distance=4.0, seed=4)
+RESULT = eg.bundle_adjust(SCENE.tracks)
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Run the command line in this process: (exit code, stdout, stderr)."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["epigauge", *map(str, arguments)])
+        with pytest.raises(SystemExit) as caught:
+            main()
+        code = caught.value.code
+        return (0 if code is None else code, *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture
+def file(tmp_path) -> Path:
+    eg.save_tracks(tmp_path / "tracks.npz", SCENE.tracks)
+    return tmp_path / "tracks.npz"
+
+
+def document(text: str) -> dict:
+    """Parse one strict JSON document with nothing around it."""
+    return json.loads(text, parse_constant=pytest.fail)
+
+
+# bundle
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".csv"])
+def test_stdout_is_the_cameras_of_the_library_to_the_last_bit(run, tmp_path, suffix) -> None:
+    eg.save_tracks(tmp_path / f"t{suffix}", SCENE.tracks)
+    code, out, err = run("bundle", tmp_path / f"t{suffix}")
+    assert code == 0
+    np.testing.assert_array_equal(
+        np.loadtxt(out.splitlines()).reshape(-1, 3, 4), RESULT.reconstruction.P
+    )
+    for word in ("5 views, 30 points", "covariant", f"{RESULT.rms_px:.6g}", "status", "seconds"):
+        assert word in err
+
+
+def test_json_is_one_document_and_nothing_else(run, file) -> None:
+    code, out, err = run("bundle", file, "--json")
+    found = document(out)
+    assert (code, err) == (0, "")
+    np.testing.assert_array_equal(found["P"], RESULT.reconstruction.P)
+    np.testing.assert_array_equal(found["Q"], RESULT.reconstruction.Q)
+    np.testing.assert_array_equal(found["fun"], RESULT.fun)
+    assert len(found["history"]) == found["nfev"] == RESULT.nfev
+    assert found["view_numbers"] == [0, 1, 2, 3, 4]
+
+
+def test_options_reach_the_solver(run, file) -> None:
+    options = {"method": "marquardt", "gauge": "normalized", "gauge_mode": "implicit"}
+    options |= {"loss": "cauchy", "max_iter": 60, "backend": "numpy"}
+    words = [w for k, v in options.items() for w in ("--" + k.replace("_", "-"), v)]
+    found = document(run("bundle", file, "--json", *words)[1])
+    expected = eg.bundle_adjust(SCENE.tracks, **options | {"gauge": eg.gauge.normalized()})
+    assert found["nfev"] == expected.nfev
+    assert found["cost"] == expected.cost
+    assert found["loss_scale_px"] == expected.loss_scale_px > 0.0
+    damped = document(run("bundle", file, "--json", "--damping", "levenberg")[1])
+    assert damped["nfev"] == eg.bundle_adjust(SCENE.tracks, damping="levenberg").nfev
+
+
+def test_saved_result_is_a_start_and_a_file_of_tracks(run, file, tmp_path) -> None:
+    assert run("bundle", file, "-o", tmp_path / "r.npz")[0] == 0
+    saved = eg.load_reconstruction(tmp_path / "r.npz")
+    np.testing.assert_array_equal(saved.P, RESULT.reconstruction.P)
+    np.testing.assert_array_equal(eg.load_tracks(tmp_path / "r.npz").xy, SCENE.tracks.xy)
+    with np.load(tmp_path / "r.npz", allow_pickle=False) as arrays:
+        np.testing.assert_array_equal(arrays["history_cost"], [r.cost for r in RESULT.history])
+    for tracks in (file, tmp_path / "r.npz"):
+        again = document(run("bundle", tracks, "--start", tmp_path / "r.npz", "--json")[1])
+        assert again["history"][0]["cost"] == pytest.approx(RESULT.cost, rel=1e-12)
+
+
+def test_cloud_holds_points_and_cameras(run, file, tmp_path) -> None:
+    assert run("bundle", file, "-o", tmp_path / "c.ply")[0] == 0
+    head, _, body = (tmp_path / "c.ply").read_bytes().partition(b"end_header\n")
+    assert b"not a calibration" in head
+    assert b"element vertex 35\n" in head
+    table = np.frombuffer(body, dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    assert np.isfinite(table["xyz"]).all()
+    assert len(np.unique(table["rgb"][:30], axis=0)) == 1
+    assert (table["rgb"][30:] != table["rgb"][0]).any(axis=1).all()
+
+
+def test_pictures_are_drawn(run, file, tmp_path) -> None:
+    pytest.importorskip("matplotlib", reason="pictures need matplotlib")
+    run("bundle", file, "--plot", tmp_path / "b.png")
+    run("compare", file, "--methods", "free,covariant", "--plot", tmp_path / "c.svg")
+    assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
+    assert "<svg" in (tmp_path / "c.svg").read_text()
+
+
+def test_only_clean_points_are_used_and_keep_their_numbers(run, tmp_path) -> None:
+    t, clean = SCENE.tracks, np.arange(30) != 11
+    np.savez(tmp_path / "t.npz", view=t.view, point=t.point, xy=t.xy, clean=clean)
+    found = document(run("bundle", tmp_path / "t.npz", "--clean", "--json")[1])
+    assert found["point_numbers"] == np.flatnonzero(clean).tolist()
+    assert len(found["Q"]) == 29
+
+
+def test_a_run_that_does_not_converge_exits_1_and_still_answers(run, file) -> None:
+    code, out, err = run("bundle", file, "--max-iter", 1)
+    assert code == 1
+    assert len(out.splitlines()) == 5
+    assert "did not converge" in err
+    assert run("compare", file, "--methods", "free,bartoli", "--max-iter", 1)[0] == 1
+
+
+def test_progress_is_shown_on_a_terminal_only(run, file, monkeypatch) -> None:
+    shown = []
+    real = Console.status
+
+    def status(self, text, **options):
+        found = real(self, text, **options)
+        update = found.update
+        found.update = lambda text: (shown.append(text), update(text))
+        return found
+
+    monkeypatch.setattr(Console, "status", status)
+    run("bundle", file)
+    assert shown == []
+    monkeypatch.setattr(Console, "is_terminal", property(lambda self: True))
+    code, out, _ = run("bundle", file)
+    assert code == 0
+    assert len(out.splitlines()) == 5
+    assert len(shown) == RESULT.nfev
+    assert shown[-1].startswith(f"evaluation {RESULT.nfev}: RMS ")
+    # The last trial is as good as the best but for the tolerance of the stopping rule.
+    assert float(shown[-1].split()[-2]) == pytest.approx(RESULT.rms_px, rel=1e-5)
+
+
+# compare
+
+
+def test_compare_shows_every_method(run, file) -> None:
+    code, out, err = run("compare", file, "--methods", "free,covariant")
+    assert (code, out) == (0, "")
+    assert "free" in err
+    assert f"{RESULT.rms_px:.6f}" in err
+    code, out, err = run("compare", file, "--methods", "free, covariant", "--markdown")
+    assert (code, err) == (0, "")
+    assert out.count("\n") == 4
+    found = document(run("compare", file, "--json", "--max-iter", 50)[1])
+    assert "covariant" in [row["method"] for row in found["rows"]]
+    covariant = found["rows"][-1]
+    assert (covariant["nfev"], covariant["cost"]) == (RESULT.nfev, RESULT.cost)
+
+
+# Bad input
+
+
+@pytest.mark.parametrize("command", ["bundle", "compare"])
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("bad.csv", "0,0,1,2\n0,1,x,2\n", "bad.csv, line 2: 'x' is not a number"),
+        ("bad.csv", "0,0,1,2\n1,0,1,2\n", "bad.csv: view 0, 1 has fewer than 6"),
+        ("bad.txt", "1 2\n", "bad.txt, line 1: is no BAL problem"),
+        ("bad.npz", "", "bad.npz: is empty"),
+        ("bad.xyz", "", "bad.xyz"),
+        ("bad.csv", None, "No such file"),
+    ],
+)
+def test_a_bad_file_is_one_clear_line_and_exit_2(
+    run, tmp_path, command, name, content, words
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    code, out, err = run(command, tmp_path / name)
+    assert (code, out) == (2, "")
+    assert words in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--method", "covarian"], "did you mean 'covariant'?"),
+        (["--gauge", "normalised"], "did you mean 'normalized'?"),
+        (["--gauge", "normalized", "--method", "bartoli"], "gauge is given with method"),
+        (["--damping", "none!"], "damping is 'none!'"),
+        (["--loss", "l3"], "loss is 'l3'"),
+        (["--max-iter", "0"], "max_iter"),
+        (["--clean"], "marks nothing as clean"),
+        (["--plot", "b.pdf"], "b.pdf"),
+        (["-o", "r.json"], "r.json"),
+        (["--start", "absent.npz"], "absent.npz: No such file"),
+    ],
+)
+def test_bad_options_are_one_clear_line_and_exit_2(run, file, options, words) -> None:
+    code, out, err = run("bundle", file, *options)
+    assert (code, out) == (2, "")
+    assert words in err
+    assert err.count("\n") == 1
+
+
+def test_start_of_another_size_is_refused(run, file, tmp_path) -> None:
+    smaller = eg.Reconstruction(RESULT.reconstruction.P[:4], RESULT.reconstruction.Q)
+    eg.save_reconstruction(tmp_path / "s.npz", smaller)
+    code, _, err = run("bundle", file, "--start", tmp_path / "s.npz")
+    assert code == 2
+    assert "start has 4 cameras and 30 points" in err
+
+
+def test_demo_has_both_jobs(run, tmp_path) -> None:
+    code, out, _ = run("demo", "--trials", 1, "--json", "-o", tmp_path)
+    found = document(out)["many_views"]
+    assert code == 0
+    costs = {row["method"]: row["cost"] for row in found["rows"]}
+    np.testing.assert_allclose(list(costs.values()), costs["covariant"], rtol=1e-6)
+    if found["picture"] is not None:
+        assert Path(found["picture"]).read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,264 @@
+"""From raw matches: inliers, accuracy, front ends, and what is refused."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import epigauge as eg
+import numpy as np
+import pytest
+from epigauge import kernels
+from epigauge.errors import MissingPackageError
+from epigauge.two_view.conditioning import condition
+from epigauge.two_view.consensus import Consensus
+from two_views import same_geometry
+
+INSTALLED = [
+    name
+    for name, module in {"poselib": "poselib", "opencv": "cv2"}.items()
+    if importlib.util.find_spec(module)
+]
+front_end = pytest.mark.skipif(not INSTALLED, reason="neither PoseLib nor OpenCV is installed")
+
+
+def spoilt(
+    wrong: int, *, m: int = 200, seed: int = 0, noise_px: float = 1.0, distance: float = 4.0
+):
+    """Return a scene, its matches with `wrong` replaced by random ones, and which are right."""
+    scene = eg.two_view_scene(n_points=m, distance=distance, noise_px=noise_px, seed=seed)
+    rng = np.random.default_rng(100 + seed)
+    x1, x2 = scene.x1.copy(), scene.x2.copy()
+    rows = rng.permutation(m)[:wrong]
+    for x in (x1, x2):
+        x[rows] = rng.uniform(x.min(axis=0), x.max(axis=0), (wrong, 2))
+    right = np.ones(m, dtype=bool)
+    right[rows] = False
+    return scene, x1, x2, right
+
+
+def error(F, scene) -> float:
+    """Root mean square distance of the noise-free matches."""
+    d = eg.reprojection_distances(F, scene.x1_true, scene.x2_true)[0]
+    return float(np.sqrt(np.mean(d**2)))
+
+
+def consensus_of(x1, x2):
+    frame = condition(x1, x2)
+    return frame, Consensus(kernels.table(), *frame.forward(x1, x2))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.5])
+def test_consensus_finds_the_right_matches_from_a_poor_start(share):
+    # Without any front end: the truth turned until hardly a match fits.
+    scene, x1, x2, right = spoilt(round(200 * share), seed=1)
+    frame, consensus = consensus_of(x1, x2)
+    rng = np.random.default_rng(0)
+    F = frame.from_pixels(scene.F_true)
+    start = consensus.judge(F + 0.02 * rng.standard_normal((3, 3)), 1.0)
+    found = consensus.search([start], rng)
+    assert found.score > start.score + 50.0
+    assert found.share == pytest.approx(1.0 - share, abs=0.1)
+    assert found.sigma * frame.scale == pytest.approx(1.0, rel=0.2)
+    inlier = found.inliers(found.mixture.even)
+    assert np.mean(inlier[right]) > 0.95
+    assert np.mean(inlier[~right]) < 0.2 if share else True
+
+
+def test_score_of_an_agreement_does_not_depend_on_the_start_of_its_scale():
+    scene, x1, x2, _ = spoilt(60)
+    frame, consensus = consensus_of(x1, x2)
+    F = frame.from_pixels(scene.F_true)
+    scores = [consensus.judge(F, sigma).score for sigma in (0.02, 0.1, 0.5)]
+    assert np.ptp(scores) < 0.1
+
+
+def test_matches_behind_a_camera_are_no_inliers():
+    scene, x1, x2, _ = spoilt(0)
+    frame, consensus = consensus_of(x1, x2)
+    F = frame.from_pixels(scene.F_true)
+    assert consensus.oriented(F).all()
+    assert consensus.oriented(-3.0 * F).all()
+    # Beyond the epipole on its own epipolar line, a match has distance zero all the same.
+    epipole = np.linalg.svd(scene.F_true)[0][:, 2]
+    x2 = x2.copy()
+    x2[0] = 2.0 * epipole[:2] / epipole[2] - scene.x2_true[0]
+    frame, consensus = consensus_of(x1, x2)
+    agreement = consensus.judge(frame.from_pixels(scene.F_true), 0.1)
+    assert abs(agreement.signed[0]) < 1.0
+    assert not agreement.inliers(1.0)[0]
+    assert agreement.oriented[1:].all()
+
+
+def test_no_collapse_onto_a_few_matches_that_fit_exactly():
+    # Eleven matches: any seven of them fit some F exactly, with no noise at all.
+    scene, x1, x2, _ = spoilt(0, m=11)
+    frame, consensus = consensus_of(x1, x2)
+    start = consensus.judge(frame.from_pixels(scene.F_true), 0.1)
+    found = consensus.search([start], np.random.default_rng(0))
+    assert np.count_nonzero(found.inliers(found.mixture.even)) >= 10
+
+
+# ---------------------------------------------------------------- the whole function
+
+
+@front_end
+@pytest.mark.parametrize("name", INSTALLED)
+@pytest.mark.parametrize("wrong", [0, 60, 100])
+def test_estimate_is_as_good_as_that_of_the_right_matches(name, wrong):
+    errors = []
+    for seed in range(4):
+        scene, x1, x2, right = spoilt(wrong, seed=seed)
+        result = eg.estimate_fundamental(x1, x2, robust=name)
+        best = eg.refine_fundamental(x1[right], x2[right])
+        errors.append([error(result.F, scene), error(best.F, scene)])
+        assert result.success
+        assert np.mean(result.inlier[right]) > 0.95
+        assert np.mean(result.inlier[~right]) < 0.2 if wrong else True
+        assert result.noise_px == pytest.approx(1.0, rel=0.2)
+        assert result.start in (name, "8point")
+    ours, possible = np.median(errors, axis=0)
+    assert ours < 2.0 * possible
+
+
+@front_end
+def test_result_is_the_refinement_of_its_inliers():
+    _, x1, x2, _ = spoilt(60)
+    result = eg.estimate_fundamental(x1, x2)
+    assert isinstance(result, eg.FundamentalResult)
+    np.testing.assert_array_equal(result.used, np.flatnonzero(result.inlier))
+    assert len(result.points) == len(result.fun) == len(result.used)
+    refined = eg.refine_fundamental(x1[result.used], x2[result.used])
+    assert same_geometry(result.F, refined.F, x1, x2) < 1e-5
+    d = np.abs(eg.reprojection_distances(result.F, x1, x2)[0])
+    assert d[result.inlier].max() <= result.threshold_px * (1.0 + 1e-9)
+    assert 1 <= result.rounds <= 20
+
+
+@front_end
+def test_same_seed_same_answer_and_another_seed_the_same_minimum():
+    _, x1, x2, _ = spoilt(60)
+    first, again = (eg.estimate_fundamental(x1, x2, seed=3) for _ in range(2))
+    np.testing.assert_array_equal(first.F, again.F)
+    np.testing.assert_array_equal(first.inlier, again.inlier)
+    other = eg.estimate_fundamental(x1, x2, seed=4)
+    assert same_geometry(first.F, other.F, x1, x2) < 1e-3
+
+
+@front_end
+def test_exact_duplicates_count_once_and_share_their_fate():
+    _, x1, x2, _ = spoilt(60)
+    rows = np.concatenate([np.arange(200), np.arange(0, 200, 3), np.arange(0, 200, 3)])
+    once, often = eg.estimate_fundamental(x1, x2), eg.estimate_fundamental(x1[rows], x2[rows])
+    np.testing.assert_array_equal(often.F, once.F)
+    np.testing.assert_array_equal(often.inlier, once.inlier[rows])
+    np.testing.assert_array_equal(often.used, once.used)
+
+
+@front_end
+@pytest.mark.parametrize("name", INSTALLED)
+def test_large_offsets_and_other_units_do_not_matter(name):
+    # OpenCV computes with single precision: an offset of 1e6 px ruins it.
+    _, x1, x2, _ = spoilt(60)
+    plain = eg.estimate_fundamental(x1, x2, robust=name)
+    moved = eg.estimate_fundamental(x1 + 1e6, x2 - 1e6, robust=name)
+    scaled = eg.estimate_fundamental(x1 / 1024.0, x2 / 1024.0, robust=name)
+    np.testing.assert_array_equal(moved.inlier, plain.inlier)
+    np.testing.assert_array_equal(scaled.inlier, plain.inlier)
+    assert moved.threshold_px == pytest.approx(plain.threshold_px, rel=1e-4)
+    assert scaled.threshold_px * 1024.0 == pytest.approx(plain.threshold_px, rel=1e-6)
+
+
+@front_end
+def test_given_threshold_is_kept():
+    _, x1, x2, _ = spoilt(60)
+    for threshold_px in (1.5, 6):
+        result = eg.estimate_fundamental(x1, x2, threshold_px=threshold_px)
+        assert result.threshold_px == pytest.approx(threshold_px, rel=1e-12)
+        d = np.abs(eg.reprojection_distances(result.F, x1, x2)[0])
+        oriented = np.count_nonzero(d <= threshold_px) - np.count_nonzero(result.inlier)
+        assert 0 <= oriented <= 5
+
+
+@front_end
+def test_noise_free_matches_with_gross_errors_give_the_truth():
+    scene, x1, x2, right = spoilt(80, noise_px=0.0)
+    result = eg.estimate_fundamental(x1, x2)
+    np.testing.assert_array_equal(result.inlier, right)
+    assert same_geometry(result.F, scene.F_true, x1, x2) < 1e-9
+
+
+@front_end
+def test_options_reach_the_refinement_and_those_of_matches_are_selected():
+    _, x1, x2, _ = spoilt(60)
+    weights = np.random.default_rng(0).uniform(0.5, 2.0, 200)
+    covariance = np.eye(2) / weights[:, None, None]
+    weighted = eg.estimate_fundamental(x1, x2, weights=weights, parameterization="block")
+    whitened = eg.estimate_fundamental(x1, x2, covariance1=covariance, covariance2=covariance)
+    np.testing.assert_array_equal(weighted.inlier, whitened.inlier)
+    assert same_geometry(weighted.F, whitened.F, x1, x2) < 1e-4
+    used = weighted.used
+    expected = eg.refine_fundamental(x1[used], x2[used], weights=weights[used])
+    assert weighted.cost == pytest.approx(expected.cost, rel=1e-8)
+    assert eg.estimate_fundamental(x1, x2, noise_px=2.0).noise_px == 2.0
+
+
+@front_end
+def test_measured_pairs_agree_with_what_their_makers_call_right(pair):
+    with np.load(pair) as data:
+        x1, x2, inlier = data["x1"], data["x2"], data["inlier"]
+    result = eg.estimate_fundamental(x1, x2)
+    assert result.success
+    # They drop duplicates and took another threshold, for the whole image or per plane.
+    assert np.mean(result.inlier[inlier]) > 0.75
+
+
+def test_without_a_front_end_the_message_names_the_remedy(monkeypatch):
+    _, x1, x2, _ = spoilt(0)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(MissingPackageError, match=r"pip install 'epigauge\[cv\]'"):
+        eg.estimate_fundamental(x1, x2)
+
+
+@front_end
+def test_front_end_that_finds_nothing_is_replaced(monkeypatch):
+    from epigauge.two_view import robust
+
+    monkeypatch.setattr(robust, "_FRONT_ENDS", {INSTALLED[0]: lambda *arguments: None})
+    scene, x1, x2, _ = spoilt(20)
+    result = eg.estimate_fundamental(x1, x2)
+    assert result.start == "8point"
+    assert error(result.F, scene) < 0.5
+
+
+@front_end
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"robust": "poslib"}, "robust.*did you mean 'poselib'"),
+        ({"threshold_px": 0.0}, "threshold_px"),
+        ({"threshold_px": "large"}, "threshold_px"),
+        ({"seed": -1}, "seed"),
+        ({"F0": np.eye(3)}, "F0"),
+        ({"weights": np.ones(3)}, "weights"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    _, x1, x2, _ = spoilt(0, m=30)
+    with pytest.raises(eg.ArgumentError, match=message):
+        eg.estimate_fundamental(x1, x2, **options)
+
+
+@front_end
+def test_too_few_different_matches_are_refused():
+    _, x1, x2, _ = spoilt(0, m=7)
+    with pytest.raises(eg.ArgumentError, match="7 matches"):
+        eg.estimate_fundamental(x1, x2)
+    with pytest.raises(eg.ArgumentError, match="7 different matches"):
+        eg.estimate_fundamental(np.tile(x1, (3, 1)), np.tile(x2, (3, 1)))
+
+
+@front_end
+def test_threshold_that_leaves_fewer_than_eight_inliers_is_refused():
+    _, x1, x2, _ = spoilt(0, m=20)
+    with pytest.raises(eg.ArgumentError, match="agree on no epipolar geometry"):
+        eg.estimate_fundamental(x1, x2, threshold_px=1e-9)
