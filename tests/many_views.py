@@ -6,6 +6,7 @@ from pathlib import Path
 
 import epigauge as eg
 import numpy as np
+import pytest
 from epigauge import kernels
 from epigauge.multi_view.gauge import Transformation
 from epigauge.multi_view.problem import BundleProblem, BundleState, Linearized
@@ -167,3 +168,10 @@ def block_diagonal(blocks: tuple[Array, Array]) -> Array:
             result[row : row + block.shape[0], column : column + block.shape[1]] = block
             row, column = row + block.shape[0], column + block.shape[1]
     return result
+
+
+def need_backend(name: str) -> None:
+    """Skip the test, with the reason, where a back end is missing."""
+    reason = eg.kernels.available()[name]
+    if reason is not None:
+        pytest.skip(f"back end {name} {reason}")

@@ -97,13 +97,16 @@ class TestResult:
         np.testing.assert_array_equal(a.reconstruction.Q, b.reconstruction.Q)
         assert [row.cost for row in a.history] == [row.cost for row in b.history]
 
+    @pytest.mark.parametrize("backend", ["c", "casadi"])
     @pytest.mark.parametrize("method", ["covariant", "free", "hartley", "gauge_invariant"])
-    def test_backends_agree(self, tracks: eg.Tracks, start: eg.Reconstruction, method: str) -> None:
+    def test_backends_agree(
+        self, tracks: eg.Tracks, start: eg.Reconstruction, method: str, backend: str
+    ) -> None:
+        many_views.need_backend(backend)
         expected = eg.bundle_adjust(tracks, start, method=method, backend="numpy")
-        for backend in ("c", "casadi"):
-            found = eg.bundle_adjust(tracks, start, method=method, backend=backend)
-            assert found.nfev == expected.nfev
-            assert found.cost == pytest.approx(expected.cost, rel=1e-10)
+        found = eg.bundle_adjust(tracks, start, method=method, backend=backend)
+        assert found.nfev == expected.nfev
+        assert found.cost == pytest.approx(expected.cost, rel=1e-10)
 
     def test_rows_in_another_order_give_the_same_answer(
         self, tracks: eg.Tracks, start: eg.Reconstruction

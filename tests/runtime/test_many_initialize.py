@@ -71,6 +71,7 @@ def test_gross_errors_in_measured_tracks(data_dir: Path, name: str) -> None:
 
 @pytest.mark.parametrize("backend", ["c", "numpy"])
 def test_the_backends_start_alike(backend: str) -> None:
+    many_views.need_backend(backend)
     tracks = many_views.observed(many_views.cameras_and_points())
     expected = eg.initialize(tracks, backend="numpy")
     found = eg.initialize(tracks, backend=backend)

@@ -35,6 +35,7 @@ def damped(system: system_module.BundleSystem, seed: int = 0) -> system_module.B
 
 @pytest.mark.parametrize("backend", kernels.NAMES)
 def test_blocks_and_gradient_equal_a_dense_jacobian_by_differences(backend: str) -> None:
+    many_views.need_backend(backend)
     problem, state, _ = many_views.small_system(3, 12)
     problem.kernels = kernels.table(backend)
     problem.weights = np.random.default_rng(0).uniform(0.5, 2.0, problem.q.shape[1])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from epigauge import kernels
 from epigauge.errors import ArgumentError
-from epigauge.multi_view import uncertainty
+from epigauge.multi_view import datum
 from epigauge.multi_view.gauge import Transformation
 from laws import central_differences, distance
 
@@ -314,8 +314,8 @@ class TestArguments:
             def transformation(self, P: Array, Q: Array) -> Transformation:
                 return eg.gauge.reference_camera().transformation(P, Q)
 
-            def constraints(self, P: Array, Q: Array) -> uncertainty.Constraints:
-                return uncertainty._constraints(eg.gauge.reference_camera(), P, Q)
+            def constraints(self, P: Array, Q: Array) -> datum.Constraints:
+                return datum._constraints(eg.gauge.reference_camera(), P, Q)
 
         class Silent:
             transformation = Own.transformation

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,101 +19,25 @@ from epigauge import kernels
 from epigauge._arguments import as_positive
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.dampings import Covariant
+from epigauge.multi_view.datum import Projector, freedom, mapped, projector
 from epigauge.multi_view.gauge import (
     Gauge,
-    five_points,
     identity,
     normalized,
-    reference_camera,
-    two_cameras,
 )
 from epigauge.multi_view.initialize import Frame
 from epigauge.multi_view.problem import BundleProblem, BundleState
 from epigauge.multi_view.system import BundleSystem, Layout
 from epigauge.multi_view.tracks import Reconstruction, Tracks
-from epigauge.two_view.free import scatter_constraints
 from epigauge.two_view.losses import Loss
 
-__all__ = ["Constraints", "ConstraintsOfGauge", "Projector", "ReconstructionCovariance"]
-__all__ += ["covariance"]
+__all__ = ["ReconstructionCovariance", "covariance"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 #: Most parameters of which `ReconstructionCovariance.dense` makes one matrix.
 _DENSE = 5000
-
-
-@dataclass(frozen=True)
-class Constraints:
-    """First-order conditions on a small motion (dP, dQ) that stays in a gauge.
-
-    Attributes
-    ----------
-    cameras : ndarray, shape (n, 12)
-        One condition a camera, ``cameras[i] @ vect(dP_i) = 0``, that fixes its scale.
-    points : ndarray, shape (m, 4)
-        One condition a point, ``points[j] @ dQ_j = 0``, that fixes its scale.
-    basis : ndarray, shape (k, 12 n + 4 m)
-        Conditions on all, ``basis @ (vect(dP), dQ) = 0``, that fix the basis; fewer than fifteen
-        independent ones leave a freedom, in which the motion is of least norm.
-    """
-
-    cameras: Array
-    points: Array
-    basis: Array
-
-
-@runtime_checkable
-class ConstraintsOfGauge(Protocol):
-    """A gauge of your own: offer this method, and `covariance` can use it."""
-
-    def constraints(self, P: Array, Q: Array) -> Constraints:
-        """Return the conditions at cameras (n, 3, 4) and points (m, 4) that are in the gauge."""
-
-
-@dataclass(frozen=True)
-class Projector:
-    """The S-transformation S: takes a small motion to the equivalent one that stays in the gauge.
-
-    S = (I - H K) L with L the scales' part and H K that of the fifteen changes of basis. S G = 0
-    for the directions G of the gauge freedom, S S = S, and N S = N.
-
-    Attributes
-    ----------
-    p, q : ndarray, shape (n, 12), (m, 4)
-        Directions of the scales of cameras and points.
-    c, d : ndarray, shape (n, 12), (m, 4)
-        Conditions on them, with c . p = 1 and d . q = 1.
-    H, K : ndarray, shape (12 n + 4 m, 15), (15, 12 n + 4 m)
-        Changes of basis and conditions on them, K H = I; K includes L.
-    """
-
-    p: Array
-    q: Array
-    c: Array
-    d: Array
-    H: Array
-    K: Array
-
-    def apply(self, motion: Array) -> Array:
-        """Return S times a motion, shape (12 n + 4 m,) or (12 n + 4 m, r)."""
-        return self._scaled(motion) - self.H @ (self.K @ motion)
-
-    def _scaled(self, motion: Array) -> Array:
-        """Return L times a motion."""
-        size = self.p.size
-        x = motion[:size].reshape(*self.p.shape, -1)
-        y = motion[size:].reshape(*self.q.shape, -1)
-        x = x - self.p[:, :, None] * np.einsum("ni,nir->nr", self.c, x)[:, None]
-        y = y - self.q[:, :, None] * np.einsum("ni,nir->nr", self.d, y)[:, None]
-        parts = x.reshape(size, -1), y.reshape(self.q.size, -1)
-        return np.concatenate(parts).reshape(motion.shape)
-
-    def locals(self) -> tuple[Array, Array]:
-        """Return the blocks of L, (n, 12, 12) and (m, 4, 4)."""
-        cameras = np.eye(12) - self.p[:, :, None] * self.c[:, None, :]
-        return cameras, np.eye(4) - self.q[:, :, None] * self.d[:, None, :]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,8 +79,8 @@ class ReconstructionCovariance:
         moved = there.apply(P, Q)
         cameras, points = there.blocks()
         maps = (cameras @ self._maps[0], points @ self._maps[1])
-        projector = _projector(gauge, *moved)
-        return replace(self, reconstruction=Reconstruction(*moved), projector=projector, _maps=maps)
+        there_too = projector(gauge, *moved)
+        return replace(self, reconstruction=Reconstruction(*moved), projector=there_too, _maps=maps)
 
     @property
     def cameras(self) -> Array:
@@ -239,7 +162,7 @@ class ReconstructionCovariance:
         size = self.reconstruction.P.size + self.reconstruction.Q.size
         if size > _DENSE:
             raise ArgumentError("covariance", f"has {size} parameters", f"at most {_DENSE}")
-        half = self.projector.apply(_mapped(self._maps, np.eye(size)))
+        half = self.projector.apply(mapped(self._maps, np.eye(size)))
         found = half @ self._inverse.apply(half.T)
         return np.asarray(0.5 * self._variance * (found + found.T))
 
@@ -253,7 +176,7 @@ class ReconstructionCovariance:
         """K X L^T (15, 12 n + 4 m) and K X K^T (15, 15), X a generalised inverse in this basis."""
         K = self.projector.K
         swapped = (np.swapaxes(self._maps[0], 1, 2), np.swapaxes(self._maps[1], 1, 2))
-        X = _mapped(self._maps, self._inverse.apply(_mapped(swapped, K.T)))
+        X = mapped(self._maps, self._inverse.apply(mapped(swapped, K.T)))
         return self.projector._scaled(X).T, K @ X
 
 
@@ -340,7 +263,7 @@ def covariance(
     out = np.einsum("nij,kl->nikjl", pixels, np.eye(4)).reshape(n, 12, 12)
     maps = (out @ cameras @ inverse.whitening[0], points @ inverse.whitening[1])
     free = ReconstructionCovariance(
-        reconstruction, noise_px, _projector(identity(), P, Q), inverse, maps
+        reconstruction, noise_px, projector(identity(), P, Q), inverse, maps
     )
     return free if gauge is None else free.in_gauge(gauge)
 
@@ -390,7 +313,7 @@ class _Inverse:
             roots = [np.swapaxes(np.linalg.cholesky(W), 1, 2) for W in Covariant().matrix(system)]
             whitening = (np.asarray(np.linalg.inv(roots[0])), np.asarray(np.linalg.inv(roots[1])))
             white: BundleSystem = system.transformed(*whitening)
-            p, q, G = _freedom(problem.kernels, state.P, state.Q, (roots[0], roots[1]))
+            p, q, G = freedom(problem.kernels, state.P, state.Q, (roots[0], roots[1]))
             white = white.damped(p[:, :, None] * p[:, None, :], q[:, :, None] * q[:, None, :])
             moves = G[: p.size]
             V_inverse = np.asarray(np.linalg.inv(white.V))
@@ -489,114 +412,3 @@ class _Inverse:
         found = J_camera @ X_ii @ np.swapaxes(J_camera, 1, 2)
         found = found + J_point @ X_jj @ np.swapaxes(J_point, 1, 2)
         return np.asarray(found + mixed + np.swapaxes(mixed, 1, 2))
-
-
-def _freedom(
-    table: kernels.Table, P: Array, Q: Array, maps: tuple[Array, Array]
-) -> tuple[Array, Array, Array]:
-    """Return unit directions of the scales, and an orthonormal basis of the changes beside them.
-
-    `maps` takes changes of (P, Q) to the parameters meant.
-    """
-    p = np.einsum("nij,nj->ni", maps[0], P.reshape(-1, 12))
-    q = np.einsum("nij,nj->ni", maps[1], Q)
-    p, q = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (p, q))
-    cameras = maps[0] @ table.camera_generators(P.transpose(1, 2, 0)).transpose(2, 0, 1)
-    points = maps[1] @ table.point_generators(Q.T).transpose(2, 0, 1)
-    cameras = cameras - p[:, :, None] * np.einsum("ni,nik->nk", p, cameras)[:, None]
-    points = points - q[:, :, None] * np.einsum("ni,nik->nk", q, points)[:, None]
-    moves = np.concatenate([cameras.reshape(-1, 16), points.reshape(-1, 16)])
-    # The identity only changes scales: one of the sixteen columns is dependent.
-    return p, q, np.asarray(np.linalg.svd(moves, full_matrices=False)[0][:, :15])
-
-
-def _projector(gauge: Gauge, P: Array, Q: Array) -> Projector:
-    """Return the projector of a gauge at a reconstruction that is in it."""
-    n, m = len(P), len(Q)
-    fixed = _constraints(gauge, P, Q)
-    table = kernels.table()
-    ones = (np.broadcast_to(np.eye(12), (n, 12, 12)), np.broadcast_to(np.eye(4), (m, 4, 4)))
-    p, q, G = _freedom(table, P, Q, ones)
-    c = fixed.cameras / np.sum(fixed.cameras * p, axis=1, keepdims=True)
-    d = fixed.points / np.sum(fixed.points * q, axis=1, keepdims=True)
-    scales = Projector(p, q, c, d, np.zeros((G.shape[0], 0)), np.zeros((0, G.shape[0])))
-    G = scales._scaled(G)
-    rows = fixed.basis / np.linalg.norm(fixed.basis, axis=1, keepdims=True)
-    U, values, Vt = np.linalg.svd(rows @ G)
-    rank = int(np.count_nonzero(values > 1e-9 * values.max(initial=0.0)))
-    left = np.linalg.qr(G @ Vt[rank:].T)[0]
-    K = np.concatenate([U[:, :rank].T @ rows, left.T])
-    H = G @ np.linalg.inv(K @ G)
-    # K L, so that a motion need not be scaled first.
-    x, y = K[:, : p.size].reshape(15, n, 12), K[:, p.size :].reshape(15, m, 4)
-    x = x - np.einsum("rni,ni->rn", x, p)[:, :, None] * c
-    y = y - np.einsum("rni,ni->rn", y, q)[:, :, None] * d
-    K = np.concatenate([x.reshape(15, -1), y.reshape(15, -1)], axis=1)
-    return replace(scales, H=H, K=K)
-
-
-def _constraints(gauge: Gauge, P: Array, Q: Array) -> Constraints:
-    """Return the linearised conditions of a gauge at a reconstruction in it."""
-    cameras, points = P.reshape(-1, 12).copy(), Q.copy()
-    third = np.tile([0.0, 0.0, 1.0, 0.0], (len(Q), 1))
-    if isinstance(gauge, identity):
-        return Constraints(cameras, points, np.zeros((0, P.size + Q.size)))
-    if isinstance(gauge, reference_camera):
-        rows = _fixed(P, Q, cameras=[gauge.camera])
-        along = np.zeros((4, *Q.shape))
-        for k in range(3):  # c is orthogonal to a, b and 1
-            along[k, :, 3] += Q[:, k]
-            along[k, :, k] += Q[:, 3]
-        along[3, :, 3] = Q[:, 3]  # and of unit mean square
-        basis = np.concatenate([np.zeros((4, P.size)), along.reshape(4, -1)], axis=1)
-        return Constraints(cameras, third, np.concatenate([rows, basis]))
-    if isinstance(gauge, two_cameras):
-        H, e = P[gauge.second, :, :3], P[gauge.second, :, 3]
-        U, _, Vt = np.linalg.svd(H)
-        canonic = np.zeros((5, len(P), 3, 4))
-        for k in range(3):  # e^T H = 0
-            canonic[k, gauge.second, :, k] = e
-            canonic[k, gauge.second, :, 3] = H[:, k]
-        canonic[3, gauge.second, :, :3] = np.outer(U[:, 0], Vt[0])  # |H| = 1
-        canonic[4, gauge.second, :, 3] = e  # |e| = 1
-        cameras[gauge.second] = canonic[4, gauge.second].ravel()
-        basis = np.concatenate([canonic[:4].reshape(4, -1), np.zeros((4, Q.size))], axis=1)
-        return Constraints(
-            cameras, third, np.concatenate([_fixed(P, Q, cameras=[gauge.first]), basis])
-        )
-    if isinstance(gauge, five_points):
-        chosen = gauge.choose(Q) if gauge.points is None else list(gauge.points)
-        return Constraints(cameras, points, _fixed(P, Q, points=chosen))
-    if isinstance(gauge, normalized):
-        scatter = scatter_constraints(Q).reshape(Q.size, -1).T
-        basis = np.concatenate([np.zeros((len(scatter), P.size)), scatter], axis=1)
-        return Constraints(cameras, points, basis)
-    if isinstance(gauge, ConstraintsOfGauge):
-        return gauge.constraints(P, Q)
-    raise ArgumentError(
-        "gauge", f"is {gauge!r}", "a gauge of eg.gauge, or one with a method constraints(P, Q)"
-    )
-
-
-def _fixed(P: Array, Q: Array, cameras: list[int] | None = None, points: ArrayLike = ()) -> Array:
-    """Return the conditions that some cameras or points change at most in scale."""
-    rows = []
-    for offset, vectors, chosen in (
-        (0, P.reshape(-1, 12), cameras or []),
-        (P.size, Q, np.asarray(points, dtype=np.intp)),
-    ):
-        width = vectors.shape[1]
-        for k in chosen:
-            across = np.linalg.svd(vectors[k][None])[2][1:]
-            block = np.zeros((width - 1, P.size + Q.size))
-            block[:, offset + width * k : offset + width * (k + 1)] = across
-            rows.append(block)
-    return np.concatenate(rows)
-
-
-def _mapped(blocks: tuple[Array, Array], vectors: Array) -> Array:
-    """Return block diagonal cameras and points times vectors (12 n + 4 m, r)."""
-    size = 12 * len(blocks[0])
-    x = blocks[0] @ vectors[:size].reshape(len(blocks[0]), 12, -1)
-    y = blocks[1] @ vectors[size:].reshape(len(blocks[1]), 4, -1)
-    return np.concatenate([x.reshape(size, -1), y.reshape(len(vectors) - size, -1)])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from epigauge.reproduce import gauge_experiments
+from epigauge.reproduce import gauge_invariance, gauge_sweeps
 from epigauge.reproduce.gauge_runs import GaugeStudy
 from epigauge.reproduce.report import Section
 from epigauge.reproduce.run import Paper
@@ -13,12 +13,12 @@ __all__ = ["EXPERIMENTS", "PAPER"]
 
 #: The experiments by name, in the order of the report.
 EXPERIMENTS: dict[str, Callable[[GaugeStudy], Section]] = {
-    "flatness": gauge_experiments.flatness,
-    "iterations": gauge_experiments.iterations,
-    "table2": gauge_experiments.hotel,
-    "bases": gauge_experiments.bases,
-    "defects": gauge_experiments.defects,
-    "starts": gauge_experiments.starts,
+    "flatness": gauge_sweeps.flatness,
+    "iterations": gauge_sweeps.iterations,
+    "table2": gauge_sweeps.hotel,
+    "bases": gauge_invariance.bases,
+    "defects": gauge_invariance.defects,
+    "starts": gauge_invariance.starts,
 }
 
 

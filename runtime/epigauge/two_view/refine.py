@@ -21,29 +21,19 @@ from epigauge._arguments import (
     check_general_position,
 )
 from epigauge.errors import ArgumentError
+from epigauge.two_view.assemble import assembled
 from epigauge.two_view.conditioning import condition
-from epigauge.two_view.covariance import (
-    fundamental_covariance,
-    residual_noise,
-    restricted_basis,
-    robust_inflation,
-    tangent_basis,
-)
 from epigauge.two_view.criteria import CRITERIA
-from epigauge.two_view.essential import motion_from_essential
 from epigauge.two_view.initial import fundamental_8point
-from epigauge.two_view.joint import intersect
 from epigauge.two_view.losses import LOSSES
-from epigauge.two_view.minima import Search, search
+from epigauge.two_view.minima import search
 from epigauge.two_view.parameterizations import (
     PARAMETERIZATIONS,
     RESTRICTABLE,
     Ortho,
-    OrthonormalF,
-    factorize,
 )
 from epigauge.two_view.result import FundamentalResult
-from epigauge.two_view.solve import DAMPINGS, REDUNDANT, Matches, Options, Solution
+from epigauge.two_view.solve import DAMPINGS, REDUNDANT, Matches, Options
 
 __all__ = ["refine_fundamental"]
 
@@ -202,7 +192,7 @@ def refine_fundamental(
     matches = Matches.of(x1, x2, w, start, kernels.table(backend), covariances)
     options = replace(options, anchor=start if options.fix else None)
     found = search(matches, options, matches.frame.from_pixels(start), starts, callback)
-    return _result(found, options, matches, noise_px)
+    return assembled(found, options, matches, noise_px)
 
 
 def _parts(fix: str | Sequence[str]) -> tuple[str, ...]:
@@ -289,118 +279,3 @@ def _start(x1: Array, x2: Array, weights: Array) -> Array:
     if np.count_nonzero(counts) < 8:
         raise ArgumentError("weights", "leave fewer than 8 matches", "8 positive ones, or F0")
     return fundamental_8point(x1[counts], x2[counts])
-
-
-def _result(
-    found: Search, options: Options, matches: Matches, noise_px: float | None
-) -> FundamentalResult:
-    """Bring the solution back to pixels and add what follows from it."""
-    solution, frame, weights = found.solution, matches.frame, matches.weights
-    outcome, chart = solution.outcome, solution.chart
-    reprojection = matches.reprojection()
-    feet = reprojection.evaluate(solution.F)
-    q1_hat, q2_hat, feet_by_entries = reprojection.corrected(feet)
-    squared = feet.squared
-    if matches.covariances is not None:
-        squared = np.sum((q1_hat - matches.q1) ** 2 + (q2_hat - matches.q2) ** 2, axis=0)
-    x1_hat, x2_hat = frame.backward(q1_hat, q2_hat)
-    F = frame.to_pixels(solution.F)
-    factors = factorize(F)
-    if options.fix:
-        factors = _with_frozen(factors, solution, options)
-        F = (factors.U[:, :2] * [1.0, factors.sigma]) @ factors.V[:, :2].T
-        F = F / np.linalg.norm(F)
-    P2 = np.asarray(matches.table.canonical_camera(*factors))
-    abc = intersect(P2, np.ascontiguousarray(x1_hat.T), np.ascontiguousarray(x2_hat.T))
-    points = np.stack([abc[0], abc[1], np.ones(abc.shape[1]), abc[2]], axis=1)
-    criterion = matches.criterion(options.criterion)
-    distances = criterion.evaluate(solution.F)
-    loss = options.scaled_loss(solution.loss_scale_px / frame.scale)
-    weight = weights * loss(distances.squared)[1]
-    derivatives = chart.derivatives(solution.motion)[0]
-    residual = residual_noise(distances.signed, weights, loss, chart.dimension)
-    if noise_px is None:
-        noise = found.evidence.noise if matches.covariances is None else residual
-        noise_px = noise * frame.scale
-    kappa = robust_inflation(distances.signed, weights, loss, chart.dimension, residual)
-    # Derivatives are by F of the norm it has inside; those by F of unit norm are so much larger.
-    norm = float(np.linalg.norm(solution.F))
-    unit = solution.F / norm
-    restricted = chart.dimension < 7
-    uncertainty = fundamental_covariance(
-        unit,
-        norm**2 * (feet_by_entries * weights) @ feet_by_entries.T,
-        kappa * (noise_px / frame.scale) ** 2,
-        frame.maps_from_pixels(),
-        restricted_basis(unit, derivatives) if restricted else tangent_basis(unit),
-    )
-    jac = frame.scale * criterion.derivative(solution.F, distances) @ derivatives
-    fun = frame.scale * distances.signed
-    grad = jac.T @ (weight * fun)
-    E, R, t = _essential(options, F, x1_hat, x2_hat)
-    return FundamentalResult(
-        F=F,
-        U=factors.U,
-        V=factors.V,
-        sigma=float(factors.sigma),
-        P1=np.eye(3, 4),
-        P2=P2,
-        points=points / np.linalg.norm(points, axis=1, keepdims=True),
-        covariance=uncertainty.of_fundamental(),
-        rank=uncertainty.rank,
-        condition=uncertainty.condition,
-        noise_px=noise_px,
-        rms_px=float(frame.scale * np.sqrt(np.mean(squared[weights > 0.0]) / 4.0)),
-        loss_scale_px=solution.loss_scale_px,
-        x=F.ravel(),
-        cost=outcome.state.cost * frame.scale**2,
-        fun=fun,
-        jac=jac,
-        grad=grad,
-        optimality=float(np.max(np.abs(grad))),
-        nfev=outcome.nfev,
-        njev=outcome.njev,
-        nit=outcome.nit,
-        status=outcome.status,
-        message=lm.STATUS[outcome.status],
-        success=outcome.status > 0,
-        history=outcome.history,
-        minima=found.minima,
-        ambiguous=found.ambiguous,
-        E=E,
-        R=R,
-        t=t,
-        _uncertainty=uncertainty,
-        _evidence=found.evidence,
-    )
-
-
-def _with_frozen(factors: OrthonormalF, solution: Solution, options: Options) -> OrthonormalF:
-    """Return the factors in pixels with the frozen parts exactly as they were, not as rounded."""
-    if "epipolar_transformation" in options.fix:
-        return OrthonormalF(*solution.motion)
-    assert options.anchor is not None
-    U, V = factors.U.copy(), factors.V.copy()
-    start = factorize(options.anchor)
-    if "epipole1" in options.fix:
-        V[:, 2] = start.V[:, 2]
-    if "epipole2" in options.fix:
-        U[:, 2] = start.U[:, 2]
-    return OrthonormalF(U, V, factors.sigma)
-
-
-def _essential(
-    options: Options, F: Array, x1_hat: Array, x2_hat: Array
-) -> tuple[Array | None, Array | None, Array | None]:
-    """Return E and the motion of calibrated cameras, None where they are not calibrated."""
-    if options.calibration is None:
-        return None, None, None
-    K1, K2 = options.calibration
-    E = K2.T @ F @ K1
-    R, t = motion_from_essential(E, _rays(K1, x1_hat), _rays(K2, x2_hat))
-    return E / np.linalg.norm(E), R, t
-
-
-def _rays(K: Array, x: Array) -> Array:
-    """Return the directions (m, 3) of pixels in the camera's frame."""
-    return np.asarray(np.linalg.solve(K, np.vstack([x.T, np.ones(len(x))])).T)
