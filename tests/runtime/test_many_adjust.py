@@ -194,7 +194,8 @@ class TestRefusals:
             ({"max_iter": 0}, "max_iter"),
             ({"ftol": 2.0}, "ftol"),
             ({"gauge": "normalized"}, "gauge is 'normalized'"),
-            ({"gauge": eg.gauge.normalized}, "gauge is"),
+            ({"gauge": "normalized"}, "gauge is"),
+            ({"gauge": int}, "gauge is"),
             ({"method": "hartley", "gauge": eg.gauge.normalized()}, "gauge is given"),
             ({"method": "mclauchlan", "gauge": eg.gauge.normalized()}, "gauge is given"),
             ({"method": "hartley", "damping": "none"}, "damping is 'none'"),
@@ -373,3 +374,11 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 / unit, result.r
     megabytes, rms = map(float, done.stdout.split())
     assert megabytes < 500.0
     assert rms < 3.0  # with the tracks that jump
+
+
+def test_a_gauge_may_be_named_without_parentheses(
+    tracks: eg.Tracks, start: eg.Reconstruction
+) -> None:
+    named = eg.bundle_adjust(tracks, start, method="levenberg", gauge=eg.gauge.normalized)
+    made = eg.bundle_adjust(tracks, start, method="levenberg", gauge=eg.gauge.normalized())
+    assert [row.cost for row in named.history] == [row.cost for row in made.history]

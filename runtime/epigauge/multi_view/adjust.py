@@ -13,7 +13,7 @@ from epigauge import kernels, lm
 from epigauge._arguments import as_choice, as_positive
 from epigauge.errors import ArgumentError
 from epigauge.multi_view import dampings
-from epigauge.multi_view.gauge import Gauge, five_points, identity, normalized
+from epigauge.multi_view.gauge import GAUGES, Gauge, five_points, identity, normalized
 from epigauge.multi_view.initialize import Frame, initialize
 from epigauge.multi_view.problem import BundleProblem
 from epigauge.multi_view.strategies import (
@@ -83,7 +83,7 @@ def bundle_adjust(
     start: Reconstruction | None = None,
     *,
     method: str = "covariant",
-    gauge: Gauge | None = None,
+    gauge: Gauge | type[Gauge] | None = None,
     gauge_mode: str = "explicit",
     damping: str | None = None,
     embedded: bool = True,
@@ -111,7 +111,7 @@ def bundle_adjust(
         of B03; "levenberg" and "marquardt" leave everything free.
     gauge : Gauge, optional
         For methods that leave everything free: a gauge to iterate in, such as
-        ``eg.gauge.normalized()``.
+        ``eg.gauge.normalized()``; without the parentheses it takes its defaults.
     gauge_mode : {"explicit", "implicit"}
         Move the estimate into the gauge before each iteration, or choose the damping that acts as
         if it were there (B03 eq. 9): the same iterates up to the gauge.
@@ -157,6 +157,8 @@ def bundle_adjust(
         as_choice("damping", damping, _DAMPINGS)
     if gauge is not None and (strategy.gauge is not None or strategy.reference):
         raise ArgumentError("gauge", f"is given with method={method!r}", "a method without its own")
+    if isinstance(gauge, type) and issubclass(gauge, GAUGES):
+        gauge = gauge()
     if gauge is not None and (isinstance(gauge, type) or not hasattr(gauge, "transformation")):
         raise ArgumentError("gauge", f"is {gauge!r}", "a gauge, such as eg.gauge.normalized()")
     act: Any = strategy.damping() if damping is None else _DAMPINGS[damping]()

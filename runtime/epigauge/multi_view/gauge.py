@@ -19,6 +19,7 @@ from epigauge.errors import ArgumentError
 from epigauge.multi_view.tracks import Reconstruction
 
 __all__ = [
+    "GAUGES",
     "Gauge",
     "Transformation",
     "equivalent",
@@ -286,6 +287,10 @@ class normalized:
             moved = moved @ ((vectors / np.sqrt(values)) @ vectors.T)
             moved = moved / np.linalg.norm(moved, axis=1, keepdims=True)
         return _unit_scales(T, P, Q)
+
+
+#: The gauges of this module.
+GAUGES = (identity, reference_camera, two_cameras, five_points, normalized)
 
 
 def _unit_scales(T: Array, P: Array, Q: Array) -> Transformation:
