@@ -23,6 +23,8 @@ ROWS = {
     "default": ({}, {}, lm.Classic),
     "Gauss-Newton": ({"hessian": "gauss-newton"}, {}, lm.Classic),
     "joint (B&S Table 1)": ({"structure": "joint"}, {}, lm.Classic),
+    "parameterization block": ({"parameterization": "block"}, {}, lm.Classic),
+    "parameterization maps": ({"parameterization": "maps"}, {}, lm.Classic),
     "damping seber": ({"damping": "seber"}, {}, lm.Classic),
     "schedule Nielsen": ({}, {}, lm.Nielsen),
     "origin at the centroid": ({}, {"OFFSET": 0.0}, lm.Classic),
