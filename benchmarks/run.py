@@ -7,7 +7,11 @@ import sys
 from pathlib import Path
 
 #: Script, arguments of a quick run. Those of packages that are not installed say so and go on.
-SCRIPTS = {"evaluations.py": ["--trials", "5"], "robust.py": ["--trials", "3"]}
+SCRIPTS = {
+    "evaluations.py": ["--trials", "5"],
+    "bias.py": ["--trials", "50"],
+    "robust.py": ["--trials", "3"],
+}
 
 
 def main() -> int:

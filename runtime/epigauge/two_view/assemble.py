@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import lm
+from epigauge.two_view.bias import bias_corrected
 from epigauge.two_view.covariance import (
     fundamental_covariance,
     residual_noise,
@@ -33,6 +36,9 @@ def assembled(
 ) -> FundamentalResult:
     """Bring the solution back to pixels and add what follows from it."""
     solution, frame, weights = found.solution, matches.frame, matches.weights
+    if options.bias_correction:
+        noise = found.evidence.noise if noise_px is None else noise_px / frame.scale
+        solution = _corrected(solution, matches, noise)
     outcome, chart = solution.outcome, solution.chart
     reprojection = matches.reprojection()
     feet = reprojection.evaluate(solution.F)
@@ -53,7 +59,11 @@ def assembled(
     criterion = matches.criterion(options.criterion)
     distances = criterion.evaluate(solution.F)
     loss = options.scaled_loss(solution.loss_scale_px / frame.scale)
-    weight = weights * loss(distances.squared)[1]
+    rho, slope, _ = loss(distances.squared)
+    cost = outcome.state.cost
+    if options.bias_correction:
+        cost = 0.5 * float(np.sum(weights * rho))
+    weight = weights * slope
     derivatives = chart.derivatives(solution.motion)[0]
     residual = residual_noise(distances.signed, weights, loss, chart.dimension)
     if noise_px is None:
@@ -90,7 +100,7 @@ def assembled(
         rms_px=float(frame.scale * np.sqrt(np.mean(squared[weights > 0.0]) / 4.0)),
         loss_scale_px=solution.loss_scale_px,
         x=F.ravel(),
-        cost=outcome.state.cost * frame.scale**2,
+        cost=cost * frame.scale**2,
         fun=fun,
         jac=jac,
         grad=grad,
@@ -110,6 +120,15 @@ def assembled(
         _uncertainty=uncertainty,
         _evidence=found.evidence,
     )
+
+
+def _corrected(solution: Solution, matches: Matches, noise: float) -> Solution:
+    """Return the solution moved by its estimated bias."""
+    reprojection = matches.reprojection()
+    feet = reprojection.evaluate(solution.F)
+    F = bias_corrected(reprojection, solution.F, feet, matches.weights, noise**2)
+    motion = solution.chart.start(F)
+    return replace(solution, F=solution.chart.fundamental(motion), motion=motion)
 
 
 def _with_frozen(factors: OrthonormalF, solution: Solution, options: Options) -> OrthonormalF:

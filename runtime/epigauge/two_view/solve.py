@@ -66,6 +66,7 @@ class Options:
     anchor: Array | None = None
     calibration: tuple[Array, Array] | None = None
     loss: str = "linear"
+    bias_correction: bool = False
     loss_scale_px: float | None = None
     stopping: lm.Stopping = field(default_factory=lm.Stopping)
 

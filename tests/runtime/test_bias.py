@@ -1,0 +1,46 @@
+"""Kanatani's bias correction: a small, consistent move that grows with the variance."""
+
+import epigauge as eg
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return eg.two_view_scene(6.0, seed=1)
+
+
+def moved_by(scene, noise_px):
+    """Return the change of F by the correction."""
+    plain = eg.refine_fundamental(scene.x1, scene.x2)
+    moved = eg.refine_fundamental(scene.x1, scene.x2, noise_px=noise_px, bias_correction=True)
+    return moved.F * np.sign(np.sum(moved.F * plain.F)) - plain.F
+
+
+def test_result_is_consistent_and_near_the_minimum(scene):
+    plain = eg.refine_fundamental(scene.x1, scene.x2, noise_px=None)
+    moved = eg.refine_fundamental(scene.x1, scene.x2, noise_px=None, bias_correction=True)
+    assert np.linalg.svd(moved.F, compute_uv=False)[2] < 1e-15
+    assert moved.cost == pytest.approx(0.5 * np.sum(moved.fun**2), rel=1e-12)
+    assert plain.cost < moved.cost < 1.01 * plain.cost
+
+
+def test_move_grows_with_the_variance_and_vanishes_without_noise(scene):
+    ratio = np.linalg.norm(moved_by(scene, 0.02)) / np.linalg.norm(moved_by(scene, 0.01))
+    assert ratio == pytest.approx(4.0, rel=0.01)  # second order in the noise
+    assert np.linalg.norm(moved_by(scene, 1e-9)) < 1e-12
+
+
+def test_weights_are_inverse_variances(scene):
+    # Weight 4 with noise 2 is weight 1 with noise 1.
+    options = {"bias_correction": True}
+    heavy = eg.refine_fundamental(
+        scene.x1, scene.x2, weights=np.full(len(scene.x1), 4.0), noise_px=2.0, **options
+    )
+    plain = eg.refine_fundamental(scene.x1, scene.x2, noise_px=1.0, **options)
+    np.testing.assert_allclose(heavy.F, plain.F, atol=1e-9)
+
+
+def test_restricted_matrices_are_refused(scene):
+    with pytest.raises(eg.ArgumentError, match="bias_correction"):
+        eg.refine_fundamental(scene.x1, scene.x2, fix="epipole1", bias_correction=True)
