@@ -99,6 +99,11 @@ class Panel:
         axes.tick_params(labelsize=9)
 
 
+def _columns(panels: int, longest: int) -> int:
+    """Return how many columns the legend has room for."""
+    return max(1, min(6, panels * 66 // (longest + 8)))
+
+
 def curves(panels: Sequence[Panel]) -> Figure:
     """Draw panels side by side with one legend.
 
@@ -135,7 +140,7 @@ def curves(panels: Sequence[Panel]) -> Figure:
         list(labels.values()),
         list(labels),
         loc="outside lower center",
-        ncols=3 if max(map(len, labels)) > 20 else 6,
+        ncols=_columns(len(panels), max(map(len, labels))),
         fontsize=9,
         frameon=False,
     )

@@ -116,7 +116,7 @@ def defects(study: GaugeStudy) -> Section:
             cells.append(float(max(found)))
             worst[item.label, kind] = cells[-1]
         rows.append((item.label, *cells))
-    table1 = worst["Table 1, |R^T R|", "condition 10"]
+    table1 = worst["Table 1, norm of R^T R", "condition 10"]
     ours = max(value for (label, _), value in worst.items() if label == STEPS[-1].label)
     return Section(
         "Invariance defect of one step",

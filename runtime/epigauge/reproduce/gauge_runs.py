@@ -167,8 +167,8 @@ STEPS = (
     Step("lambda I", dampings.Levenberg()),
     Step("lambda diag N", dampings.Marquardt()),
     Step("pseudo-inverse", dampings.PseudoInverse()),
-    Step("Table 1, |R^T R|", dampings.GaugeInvariant("product")),
-    Step("Table 1, |vec R|", dampings.GaugeInvariant("factor")),
+    Step("Table 1, norm of R^T R", dampings.GaugeInvariant("product")),
+    Step("Table 1, norm of vec R", dampings.GaugeInvariant("factor")),
     Step("covariant, in the basis given", dampings.Covariant()),
     Step("covariant, in the normalised basis", dampings.Covariant(), normalized()),
 )

@@ -112,7 +112,7 @@ def flatness(study: GaugeStudy) -> Section:
             "section 7.1",
             "GAUGE_INVARIANT is the least sensitive to the instability of the scene",
             bool((mean_steps[at["gauge_invariant"]] <= mean_steps[paper].min(axis=0)).all()),
-            "with |R^T R| normalised as Table 1 prints: "
+            "with the norm of R^T R fixed as Table 1 prints: "
             + ", ".join(f"{value:.1f}" for value in mean_steps[at["gauge_invariant"]])
             + "; solved by a singular vector as the text says, of rank one: "
             + ", ".join(f"{value:.0f}" for value in mean_steps[at["gauge_invariant_factor"]])
