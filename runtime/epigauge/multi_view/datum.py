@@ -22,7 +22,7 @@ from epigauge.multi_view.gauge import (
     reference_camera,
     two_cameras,
 )
-from epigauge.two_view.free import scatter_constraints
+from epigauge.scatter import scatter_constraints
 
 __all__ = [
     "Constraints",

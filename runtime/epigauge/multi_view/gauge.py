@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.tracks import Reconstruction
+from epigauge.scatter import spreading_basis
 
 __all__ = [
     "GAUGES",
@@ -277,16 +278,7 @@ class normalized:
 
     def transformation(self, P: Array, Q: Array) -> Transformation:
         """Return what moves cameras and points into the gauge."""
-        T = np.eye(4)
-        moved = Q / np.linalg.norm(Q, axis=1, keepdims=True)
-        for _ in range(200):
-            values, vectors = np.linalg.eigh(moved.T @ moved * (4.0 / len(Q)))
-            if values[0] <= 1e-14 or abs(values - 1.0).max() <= 1e-13:
-                break
-            T = T @ ((vectors * np.sqrt(values)) @ vectors.T)
-            moved = moved @ ((vectors / np.sqrt(values)) @ vectors.T)
-            moved = moved / np.linalg.norm(moved, axis=1, keepdims=True)
-        return _unit_scales(T, P, Q)
+        return _unit_scales(spreading_basis(Q), P, Q)
 
 
 #: The gauges of this module.

@@ -12,7 +12,7 @@ from epigauge.multi_view import dampings
 from epigauge.multi_view.gauge import Gauge, five_points, normalized, reference_camera, two_cameras
 from epigauge.multi_view.null_space import scales
 from epigauge.multi_view.problem import BundleProblem, BundleState, Linearized
-from epigauge.two_view.free import scatter_constraints
+from epigauge.scatter import scatter_constraints
 from epigauge.two_view.parameterizations import Ortho, OrthonormalF
 
 __all__ = ["STRATEGIES", "ExplicitProblem", "RestrictedProblem", "Strategy"]

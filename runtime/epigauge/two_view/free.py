@@ -9,17 +9,12 @@ from numpy.typing import NDArray
 
 from epigauge.kernels import Table
 from epigauge.linear import Arrow
+from epigauge.scatter import scatter_constraints, spreading_basis
 from epigauge.two_view.joint import first_structure, reweighted
 from epigauge.two_view.losses import Loss
 from epigauge.two_view.parameterizations import factorize
 
-__all__ = [
-    "FreeProblem",
-    "FreeState",
-    "fundamental_from_cameras",
-    "normalized_basis",
-    "scatter_constraints",
-]
+__all__ = ["FreeProblem", "FreeState", "fundamental_from_cameras"]
 
 Array = NDArray[np.float64]
 Estimate = tuple[Array, Array]  # cameras (2, 3, 4) and points (4, m)
@@ -34,35 +29,6 @@ def fundamental_from_cameras(cameras: Array) -> Array:
         [np.vstack([first[_OTHERS[j]], second[_OTHERS[i]]]) for j in range(3)] for i in range(3)
     ]
     return np.asarray(np.linalg.det(np.array(blocks)))
-
-
-def normalized_basis(cameras: Array, Q: Array) -> Estimate:
-    """Move a reconstruction to the normalised basis: unit norms and sum Q Q^T = (m / 4) I.
-
-    The fixed point of Q <- (sum Q Q^T / Q^T Q)^(-1/2) Q, Tyler's scatter iteration, leaves an
-    orthonormal transformation of the basis open.
-
-    Parameters
-    ----------
-    cameras : ndarray, shape (n, 3, 4)
-        Cameras.
-    Q : ndarray, shape (4, m)
-        Homogeneous points, not all in one plane.
-
-    Returns
-    -------
-    cameras, Q : ndarray
-        The same geometry; where no such basis exists (too many points in a plane or on a line)
-        the last one reached.
-    """
-    for _ in range(100):
-        Q = Q / np.linalg.norm(Q, axis=0)
-        values, vectors = np.linalg.eigh(Q @ Q.T * (4.0 / Q.shape[1]))
-        if values[0] <= 1e-12 or abs(values - 1.0).max() <= 1e-12:
-            break
-        Q = (vectors / np.sqrt(values)) @ vectors.T @ Q
-        cameras = cameras @ ((vectors * np.sqrt(values)) @ vectors.T)
-    return cameras / np.linalg.norm(cameras, axis=(1, 2), keepdims=True), Q
 
 
 @dataclass(frozen=True)
@@ -163,30 +129,9 @@ class FreeProblem:
         return fundamental_from_cameras(state.cameras)
 
     def _settled(self, cameras: Array, Q: Array) -> Estimate:
-        return normalized_basis(cameras, Q) if self.normalized else (cameras, Q)
-
-
-def scatter_constraints(Q: Array) -> Array:
-    """Return the ten first-order constraints sum (Q dQ^T + dQ Q^T) = 0.
-
-    Weighted such that the sum of their squares is that of the symmetric matrix' entries, which an
-    orthonormal change of basis leaves alone.
-
-    Parameters
-    ----------
-    Q : ndarray, shape (m, 4)
-        Points.
-
-    Returns
-    -------
-    ndarray, shape (m, 4, 10)
-        Coefficients of dQ.
-    """
-    columns = []
-    for a in range(4):
-        for b in range(a, 4):
-            column = np.zeros_like(Q)
-            column[:, a] += Q[:, b]
-            column[:, b] += Q[:, a]
-            columns.append(column if a == b else np.sqrt(2.0) * column)
-    return np.stack(columns, axis=2)
+        if not self.normalized:
+            return cameras, Q
+        T = spreading_basis(Q.T)
+        cameras, points = cameras @ T, np.asarray(np.linalg.solve(T, Q))
+        sizes = np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
+        return cameras / sizes, points / np.linalg.norm(points, axis=0)
