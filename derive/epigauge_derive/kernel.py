@@ -24,6 +24,16 @@ class select(sp.Function):
     nargs = 3
 
 
+class log1p(sp.Function):
+    """log(1 + x), exact for small x."""
+
+    nargs = 1
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        """Return 1 / (1 + x)."""
+        return 1 / (1 + self.args[0])
+
+
 @dataclass(frozen=True)
 class Input:
     """An array argument. A shared one has the same value for all observations of a call."""

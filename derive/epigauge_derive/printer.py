@@ -20,7 +20,7 @@ class Printer:
     Parameters
     ----------
     functions : mapping
-        Spelling of ``sqrt``, ``sin``, ``cos``, ``atan2``, ``abs``.
+        Spelling of ``sqrt``, ``sin``, ``cos``, ``atan2``, ``abs``, ``log1p``.
     select : str
         Format of the branch with fields ``condition``, ``then`` and ``other``.
     """
@@ -54,8 +54,8 @@ class Printer:
             condition, then, other = arguments
             text = self._select.format(condition=condition, then=then, other=other)
             return text, _ATOM
-        key = {"sin": "sin", "cos": "cos", "atan2": "atan2", "Abs": "abs"}.get(name)
-        if key is None:
+        key = "abs" if name == "Abs" else name
+        if key not in self._functions:
             raise TypeError(f"no rule to print {name} in {e}")
         return f"{self._functions[key]}({', '.join(arguments)})", _ATOM
 

@@ -50,6 +50,63 @@ EG_EXPORT void eg_block_retract(
     double *EG_RESTRICT V_new,
     double *EG_RESTRICT M_new);
 
+EG_EXPORT void eg_squared_distance(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P,
+    const double *EG_RESTRICT Q,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT squared);
+
+EG_EXPORT void eg_point_normal(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P,
+    const double *EG_RESTRICT Q,
+    const double *EG_RESTRICT q,
+    const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT V,
+    double *EG_RESTRICT D,
+    double *EG_RESTRICT g,
+    double *EG_RESTRICT squared);
+
+EG_EXPORT void eg_camera_normal(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P,
+    const double *EG_RESTRICT Q,
+    const double *EG_RESTRICT q,
+    const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT A,
+    double *EG_RESTRICT depth,
+    double *EG_RESTRICT e);
+
+EG_EXPORT void eg_coupling(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P,
+    const double *EG_RESTRICT Q,
+    const double *EG_RESTRICT weight_array,
+    const double *EG_RESTRICT T,
+    double *EG_RESTRICT Y);
+
+EG_EXPORT void eg_inverse_root(
+    ptrdiff_t n,
+    const double *EG_RESTRICT V,
+    double *EG_RESTRICT T);
+
+EG_EXPORT void eg_damped_inverse_root(
+    ptrdiff_t n,
+    const double *EG_RESTRICT V,
+    const double *EG_RESTRICT W,
+    const double *EG_RESTRICT lam_array,
+    double *EG_RESTRICT T);
+
+EG_EXPORT void eg_point_step(
+    ptrdiff_t n,
+    const double *EG_RESTRICT V,
+    const double *EG_RESTRICT W,
+    const double *EG_RESTRICT g,
+    const double *EG_RESTRICT lam_array,
+    double *EG_RESTRICT step,
+    double *EG_RESTRICT promised);
+
 EG_EXPORT void eg_project(
     ptrdiff_t n,
     const double *EG_RESTRICT P,
@@ -108,6 +165,7 @@ EG_EXPORT void eg_epipolar_gauss_newton(
     const double *EG_RESTRICT q1,
     const double *EG_RESTRICT q2,
     const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT cost,
     double *EG_RESTRICT g,
     double *EG_RESTRICT N);
 
@@ -118,7 +176,9 @@ EG_EXPORT void eg_epipolar_newton(
     const double *EG_RESTRICT q2,
     const double *EG_RESTRICT weight_array,
     const double *EG_RESTRICT curvature_array,
+    double *EG_RESTRICT cost,
     double *EG_RESTRICT g,
+    double *EG_RESTRICT N,
     double *EG_RESTRICT H);
 
 EG_EXPORT void eg_sampson(
@@ -135,6 +195,7 @@ EG_EXPORT void eg_sampson_gauss_newton(
     const double *EG_RESTRICT q1,
     const double *EG_RESTRICT q2,
     const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT cost,
     double *EG_RESTRICT g,
     double *EG_RESTRICT N);
 
@@ -145,13 +206,47 @@ EG_EXPORT void eg_sampson_newton(
     const double *EG_RESTRICT q2,
     const double *EG_RESTRICT weight_array,
     const double *EG_RESTRICT curvature_array,
+    double *EG_RESTRICT cost,
     double *EG_RESTRICT g,
+    double *EG_RESTRICT N,
     double *EG_RESTRICT H);
 
 EG_EXPORT void eg_error_series(
     ptrdiff_t n,
     const double *EG_RESTRICT K,
     double *EG_RESTRICT e);
+
+EG_EXPORT void eg_loss_huber(
+    ptrdiff_t n,
+    const double *EG_RESTRICT squared_array,
+    const double *EG_RESTRICT scale2_array,
+    double *EG_RESTRICT value,
+    double *EG_RESTRICT first,
+    double *EG_RESTRICT second);
+
+EG_EXPORT void eg_loss_soft_l1(
+    ptrdiff_t n,
+    const double *EG_RESTRICT squared_array,
+    const double *EG_RESTRICT scale2_array,
+    double *EG_RESTRICT value,
+    double *EG_RESTRICT first,
+    double *EG_RESTRICT second);
+
+EG_EXPORT void eg_loss_cauchy(
+    ptrdiff_t n,
+    const double *EG_RESTRICT squared_array,
+    const double *EG_RESTRICT scale2_array,
+    double *EG_RESTRICT value,
+    double *EG_RESTRICT first,
+    double *EG_RESTRICT second);
+
+EG_EXPORT void eg_loss_truncated(
+    ptrdiff_t n,
+    const double *EG_RESTRICT squared_array,
+    const double *EG_RESTRICT scale2_array,
+    double *EG_RESTRICT value,
+    double *EG_RESTRICT first,
+    double *EG_RESTRICT second);
 
 EG_EXPORT void eg_maps_000(
     ptrdiff_t n,
@@ -477,6 +572,16 @@ EG_EXPORT void eg_maps_223(
     double *EG_RESTRICT P2,
     double *EG_RESTRICT dP2);
 
+EG_EXPORT void eg_pseudo_object_space(
+    ptrdiff_t n,
+    const double *EG_RESTRICT eta_array,
+    const double *EG_RESTRICT P,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_P,
+    double *EG_RESTRICT J_X);
+
 EG_EXPORT void eg_fundamental_from_factors(
     ptrdiff_t n,
     const double *EG_RESTRICT U,
@@ -542,6 +647,20 @@ EG_EXPORT void eg_foot_point(
     double *EG_RESTRICT last_change,
     double *EG_RESTRICT d);
 
+EG_EXPORT void eg_foot_point_more(
+    ptrdiff_t n,
+    const double *EG_RESTRICT R1,
+    const double *EG_RESTRICT R2,
+    const double *EG_RESTRICT s,
+    const double *EG_RESTRICT b1,
+    const double *EG_RESTRICT b2,
+    const double *EG_RESTRICT f_array,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    double *EG_RESTRICT multiplier,
+    double *EG_RESTRICT last_change,
+    double *EG_RESTRICT d);
+
 EG_EXPORT void eg_foot_point_safe(
     ptrdiff_t n,
     const double *EG_RESTRICT R1,
@@ -572,6 +691,20 @@ EG_EXPORT void eg_foot_point_derivative(
     double *EG_RESTRICT dd_dF);
 
 EG_EXPORT void eg_foot_point_each(
+    ptrdiff_t n,
+    const double *EG_RESTRICT R1,
+    const double *EG_RESTRICT R2,
+    const double *EG_RESTRICT s,
+    const double *EG_RESTRICT b1,
+    const double *EG_RESTRICT b2,
+    const double *EG_RESTRICT f_array,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    double *EG_RESTRICT multiplier,
+    double *EG_RESTRICT last_change,
+    double *EG_RESTRICT d);
+
+EG_EXPORT void eg_foot_point_more_each(
     ptrdiff_t n,
     const double *EG_RESTRICT R1,
     const double *EG_RESTRICT R2,
@@ -643,6 +776,7 @@ EG_EXPORT void eg_reprojection_newton(
     const double *EG_RESTRICT weight_array,
     const double *EG_RESTRICT curvature_array,
     double *EG_RESTRICT g,
+    double *EG_RESTRICT N,
     double *EG_RESTRICT H);
 
 EG_EXPORT void eg_rotation(

@@ -65,12 +65,12 @@ EG_EXPORT void eg_bilinear_frame(
     }
 }
 
-/* Formula: multiplier l of the foot point by 2 passes of bracketed Newton from the Sampson
-   correction, its last change, and the signed distance d = l |n|.
+/* Formula: multiplier l of the foot point by 2 passes of Newton from the Sampson correction,
+   its last change, and the signed distance d = l |n|.
    Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
    f () shared, q1 (2,), q2 (2,)
    Outputs: multiplier (), last_change (), d ()
-   Operations: 216, temporaries: 56. */
+   Operations: 188, temporaries: 53. */
 EG_EXPORT void eg_foot_point(
     ptrdiff_t n,
     const double *EG_RESTRICT R1,
@@ -106,7 +106,6 @@ EG_EXPORT void eg_foot_point(
         const double q1_1 = q1[n + i];
         const double q2_0 = q2[i];
         const double q2_1 = q2[n + i];
-        const double pole = 0.9999999999999858/(1e-140 + s0);
         const double a1_0 = R1_00*q1_0 + R1_10*q1_1;
         const double a1_1 = R1_01*q1_0 + R1_11*q1_1;
         const double a2_0 = R2_00*q2_0 + R2_10*q2_1;
@@ -125,78 +124,319 @@ EG_EXPORT void eg_foot_point(
         const double t7 = b1_1 + a2_1*s1 - t3;
         const double hh3 = 0.5*t7*t7;
         const double start = C0/(1e-300 + hh0 + hh1 + hh2 + hh3);
-        double l = ((-pole - start)*(pole - start) > 0.0 ? 0.0 : start);
-        double low = (C0 > 0.0 ? 0.0 : -pole);
-        double high = (C0 > 0.0 ? pole : 0.0);
+        double l = start;
         double change = 0.0;
         {
             const double t8 = l*s0;
             const double below0 = 1.0 - t8;
             const double above0 = 1.0 + t8;
-            const double inverse0 = 1.0/(above0*below0);
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
             const double r0 = below0*inverse0;
             const double r1 = above0*inverse0;
-            const double t9 = l*s1;
-            const double below1 = 1.0 - t9;
-            const double above1 = 1.0 + t9;
-            const double inverse1 = 1.0/(above1*below1);
+            const double inverse1 = inverse*pair0;
             const double r2 = below1*inverse1;
             const double r3 = above1*inverse1;
-            const double t10 = 0.5*t8;
-            const double t11 = 0.5*t9;
-            const double value = C0 - hh0*l*r0*r0*(1.0 + t10) - hh1*l*r1*r1*(1.0 - t10) - hh2*l*r2*r2*(1.0 + t11) - hh3*l*r3*r3*(1.0 - t11);
-            const double high_new = (value > 0.0 ? high : l);
-            const double low_new = (value > 0.0 ? l : low);
-            const double step = value/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
-            const double t12 = l + step;
-            const double moved = ((high_new - t12)*(low_new - t12) > 0.0 ? 0.5*high_new + 0.5*low_new : t12);
-            const double t13 = moved - l;
-            l = moved;
-            low = low_new;
-            high = high_new;
-            change = t13;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
         }
         {
             const double t8 = l*s0;
             const double below0 = 1.0 - t8;
             const double above0 = 1.0 + t8;
-            const double inverse0 = 1.0/(above0*below0);
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
             const double r0 = below0*inverse0;
             const double r1 = above0*inverse0;
-            const double t9 = l*s1;
-            const double below1 = 1.0 - t9;
-            const double above1 = 1.0 + t9;
-            const double inverse1 = 1.0/(above1*below1);
+            const double inverse1 = inverse*pair0;
             const double r2 = below1*inverse1;
             const double r3 = above1*inverse1;
-            const double t10 = 0.5*t8;
-            const double t11 = 0.5*t9;
-            const double value = C0 - hh0*l*r0*r0*(1.0 + t10) - hh1*l*r1*r1*(1.0 - t10) - hh2*l*r2*r2*(1.0 + t11) - hh3*l*r3*r3*(1.0 - t11);
-            const double high_new = (value > 0.0 ? high : l);
-            const double low_new = (value > 0.0 ? l : low);
-            const double step = value/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
-            const double t12 = l + step;
-            const double moved = ((high_new - t12)*(low_new - t12) > 0.0 ? 0.5*high_new + 0.5*low_new : t12);
-            const double t13 = moved - l;
-            l = moved;
-            low = low_new;
-            high = high_new;
-            change = t13;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
         }
-        const double t14 = l*s0;
-        const double below0 = 1.0 - t14;
-        const double above0 = 1.0 + t14;
-        const double inverse0 = 1.0/(above0*below0);
+        const double last = (0.9999999999999858 - s0*fabs(l) > 0.0 ? change : l);
+        const double t11 = l*s0;
+        const double below0 = 1.0 - t11;
+        const double above0 = 1.0 + t11;
+        const double pair0 = above0*below0;
+        const double t12 = l*s1;
+        const double above1 = 1.0 + t12;
+        const double below1 = 1.0 - t12;
+        const double pair1 = above1*below1;
+        const double inverse = 1.0/(pair0*pair1);
+        const double inverse0 = inverse*pair1;
         const double r0 = below0*inverse0;
         const double r1 = above0*inverse0;
-        const double t15 = l*s1;
-        const double below1 = 1.0 - t15;
-        const double above1 = 1.0 + t15;
-        const double inverse1 = 1.0/(above1*below1);
+        const double inverse1 = inverse*pair0;
         const double r2 = below1*inverse1;
         const double r3 = above1*inverse1;
         multiplier[i] = l;
-        last_change[i] = change;
+        last_change[i] = last;
+        d[i] = l*sqrt(hh0*r0*r0 + hh1*r1*r1 + hh2*r2*r2 + hh3*r3*r3);
+    }
+}
+
+/* Formula: multiplier l of the foot point by 8 passes of Newton from the Sampson correction,
+   its last change, and the signed distance d = l |n|.
+   Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
+   f () shared, q1 (2,), q2 (2,)
+   Outputs: multiplier (), last_change (), d ()
+   Operations: 500, temporaries: 53. */
+EG_EXPORT void eg_foot_point_more(
+    ptrdiff_t n,
+    const double *EG_RESTRICT R1,
+    const double *EG_RESTRICT R2,
+    const double *EG_RESTRICT s,
+    const double *EG_RESTRICT b1,
+    const double *EG_RESTRICT b2,
+    const double *EG_RESTRICT f_array,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    double *EG_RESTRICT multiplier,
+    double *EG_RESTRICT last_change,
+    double *EG_RESTRICT d)
+{
+    const double R1_00 = R1[0];
+    const double R1_01 = R1[1];
+    const double R1_10 = R1[2];
+    const double R1_11 = R1[3];
+    const double R2_00 = R2[0];
+    const double R2_01 = R2[1];
+    const double R2_10 = R2[2];
+    const double R2_11 = R2[3];
+    const double s0 = s[0];
+    const double s1 = s[1];
+    const double b1_0 = b1[0];
+    const double b1_1 = b1[1];
+    const double b2_0 = b2[0];
+    const double b2_1 = b2[1];
+    const double f = f_array[0];
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double q1_0 = q1[i];
+        const double q1_1 = q1[n + i];
+        const double q2_0 = q2[i];
+        const double q2_1 = q2[n + i];
+        const double a1_0 = R1_00*q1_0 + R1_10*q1_1;
+        const double a1_1 = R1_01*q1_0 + R1_11*q1_1;
+        const double a2_0 = R2_00*q2_0 + R2_10*q2_1;
+        const double a2_1 = R2_01*q2_0 + R2_11*q2_1;
+        const double t0 = b1_0 + a2_0*s0;
+        const double t1 = b1_1 + a2_1*s1;
+        const double C0 = f + a1_0*t0 + a1_1*t1 + a2_0*b2_0 + a2_1*b2_1;
+        const double t2 = b2_0 + a1_0*s0;
+        const double t4 = t0 + t2;
+        const double hh0 = 0.5*t4*t4;
+        const double t5 = b1_0 + a2_0*s0 - t2;
+        const double hh1 = 0.5*t5*t5;
+        const double t3 = b2_1 + a1_1*s1;
+        const double t6 = t1 + t3;
+        const double hh2 = 0.5*t6*t6;
+        const double t7 = b1_1 + a2_1*s1 - t3;
+        const double hh3 = 0.5*t7*t7;
+        const double start = C0/(1e-300 + hh0 + hh1 + hh2 + hh3);
+        double l = start;
+        double change = 0.0;
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        const double last = (0.9999999999999858 - s0*fabs(l) > 0.0 ? change : l);
+        const double t11 = l*s0;
+        const double below0 = 1.0 - t11;
+        const double above0 = 1.0 + t11;
+        const double pair0 = above0*below0;
+        const double t12 = l*s1;
+        const double above1 = 1.0 + t12;
+        const double below1 = 1.0 - t12;
+        const double pair1 = above1*below1;
+        const double inverse = 1.0/(pair0*pair1);
+        const double inverse0 = inverse*pair1;
+        const double r0 = below0*inverse0;
+        const double r1 = above0*inverse0;
+        const double inverse1 = inverse*pair0;
+        const double r2 = below1*inverse1;
+        const double r3 = above1*inverse1;
+        multiplier[i] = l;
+        last_change[i] = last;
         d[i] = l*sqrt(hh0*r0*r0 + hh1*r1*r1 + hh2*r2*r2 + hh3*r3*r3);
     }
 }
@@ -206,7 +446,7 @@ EG_EXPORT void eg_foot_point(
    Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
    f () shared, q1 (2,), q2 (2,)
    Outputs: multiplier (), last_change (), d ()
-   Operations: 6488, temporaries: 56. */
+   Operations: 6290, temporaries: 60. */
 EG_EXPORT void eg_foot_point_safe(
     ptrdiff_t n,
     const double *EG_RESTRICT R1,
@@ -268,39 +508,43 @@ EG_EXPORT void eg_foot_point_safe(
             const double t8 = l*s0;
             const double below0 = 1.0 - t8;
             const double above0 = 1.0 + t8;
-            const double inverse0 = 1.0/(above0*below0);
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
             const double r0 = below0*inverse0;
             const double r1 = above0*inverse0;
-            const double t9 = l*s1;
-            const double below1 = 1.0 - t9;
-            const double above1 = 1.0 + t9;
-            const double inverse1 = 1.0/(above1*below1);
+            const double inverse1 = inverse*pair0;
             const double r2 = below1*inverse1;
             const double r3 = above1*inverse1;
-            const double t10 = 0.5*t8;
-            const double t11 = 0.5*t9;
-            const double value = C0 - hh0*l*r0*r0*(1.0 + t10) - hh1*l*r1*r1*(1.0 - t10) - hh2*l*r2*r2*(1.0 + t11) - hh3*l*r3*r3*(1.0 - t11);
+            const double value = C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3);
             const double high_new = (value > 0.0 ? high : l);
             const double low_new = (value > 0.0 ? l : low);
             const double step = value/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
-            const double t12 = l + step;
-            const double moved = ((high_new - t12)*(low_new - t12) > 0.0 ? 0.5*high_new + 0.5*low_new : t12);
-            const double t13 = moved - l;
+            const double t10 = l + step;
+            const double moved = ((high_new - t10)*(low_new - t10) > 0.0 ? 0.5*high_new + 0.5*low_new : t10);
+            const double t11 = moved - l;
             l = moved;
             low = low_new;
             high = high_new;
-            change = t13;
+            change = t11;
         }
-        const double t14 = l*s0;
-        const double below0 = 1.0 - t14;
-        const double above0 = 1.0 + t14;
-        const double inverse0 = 1.0/(above0*below0);
+        const double t12 = l*s0;
+        const double below0 = 1.0 - t12;
+        const double above0 = 1.0 + t12;
+        const double pair0 = above0*below0;
+        const double t13 = l*s1;
+        const double above1 = 1.0 + t13;
+        const double below1 = 1.0 - t13;
+        const double pair1 = above1*below1;
+        const double inverse = 1.0/(pair0*pair1);
+        const double inverse0 = inverse*pair1;
         const double r0 = below0*inverse0;
         const double r1 = above0*inverse0;
-        const double t15 = l*s1;
-        const double below1 = 1.0 - t15;
-        const double above1 = 1.0 + t15;
-        const double inverse1 = 1.0/(above1*below1);
+        const double inverse1 = inverse*pair0;
         const double r2 = below1*inverse1;
         const double r3 = above1*inverse1;
         multiplier[i] = l;
@@ -314,7 +558,7 @@ EG_EXPORT void eg_foot_point_safe(
    Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
    f () shared, q1 (2,), q2 (2,), l ()
    Outputs: q1_hat (2,), q2_hat (2,), dd_dF (9,)
-   Operations: 101, temporaries: 40. */
+   Operations: 103, temporaries: 43. */
 EG_EXPORT void eg_foot_point_derivative(
     ptrdiff_t n,
     const double *EG_RESTRICT R1,
@@ -356,8 +600,14 @@ EG_EXPORT void eg_foot_point_derivative(
         const double a2_1 = R2_01*q2_0 + R2_11*q2_1;
         const double t1 = l*s1;
         const double below1 = 1.0 - t1;
+        const double t0 = l*s0;
+        const double above0 = 1.0 + t0;
+        const double below0 = 1.0 - t0;
+        const double pair0 = above0*below0;
         const double above1 = 1.0 + t1;
-        const double inverse1 = 1.0/(above1*below1);
+        const double pair1 = above1*below1;
+        const double inverse = 1.0/(pair0*pair1);
+        const double inverse1 = inverse*pair0;
         const double r2 = below1*inverse1;
         const double t3 = 0.5*sqrt(2.0);
         const double t9 = b2_1 + a1_1*s1;
@@ -369,10 +619,7 @@ EG_EXPORT void eg_foot_point_derivative(
         const double t13 = a1_1 - t12*t7;
         const double a1_0 = R1_00*q1_0 + R1_10*q1_1;
         const double a2_0 = R2_00*q2_0 + R2_10*q2_1;
-        const double t0 = l*s0;
-        const double below0 = 1.0 - t0;
-        const double above0 = 1.0 + t0;
-        const double inverse0 = 1.0/(above0*below0);
+        const double inverse0 = inverse*pair1;
         const double r0 = below0*inverse0;
         const double t2 = b2_0 + a1_0*s0;
         const double t4 = r0*t3*(b1_0 + t2 + a2_0*s0);
@@ -408,12 +655,11 @@ EG_EXPORT void eg_foot_point_derivative(
     }
 }
 
-/* Formula: multiplier l of the foot point by 2 passes of bracketed Newton from the Sampson
-   correction, its last change, and the signed distance d = l |n|; each match with its own
-   frame.
+/* Formula: multiplier l of the foot point by 2 passes of Newton from the Sampson correction,
+   its last change, and the signed distance d = l |n|; each match with its own frame.
    Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,)
    Outputs: multiplier (), last_change (), d ()
-   Operations: 216, temporaries: 56. */
+   Operations: 188, temporaries: 53. */
 EG_EXPORT void eg_foot_point_each(
     ptrdiff_t n,
     const double *EG_RESTRICT R1,
@@ -449,7 +695,6 @@ EG_EXPORT void eg_foot_point_each(
         const double q1_1 = q1[n + i];
         const double q2_0 = q2[i];
         const double q2_1 = q2[n + i];
-        const double pole = 0.9999999999999858/(1e-140 + s0);
         const double a1_0 = R1_00*q1_0 + R1_10*q1_1;
         const double a1_1 = R1_01*q1_0 + R1_11*q1_1;
         const double a2_0 = R2_00*q2_0 + R2_10*q2_1;
@@ -468,78 +713,318 @@ EG_EXPORT void eg_foot_point_each(
         const double t7 = b1_1 + a2_1*s1 - t3;
         const double hh3 = 0.5*t7*t7;
         const double start = C0/(1e-300 + hh0 + hh1 + hh2 + hh3);
-        double l = ((-pole - start)*(pole - start) > 0.0 ? 0.0 : start);
-        double low = (C0 > 0.0 ? 0.0 : -pole);
-        double high = (C0 > 0.0 ? pole : 0.0);
+        double l = start;
         double change = 0.0;
         {
             const double t8 = l*s0;
             const double below0 = 1.0 - t8;
             const double above0 = 1.0 + t8;
-            const double inverse0 = 1.0/(above0*below0);
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
             const double r0 = below0*inverse0;
             const double r1 = above0*inverse0;
-            const double t9 = l*s1;
-            const double below1 = 1.0 - t9;
-            const double above1 = 1.0 + t9;
-            const double inverse1 = 1.0/(above1*below1);
+            const double inverse1 = inverse*pair0;
             const double r2 = below1*inverse1;
             const double r3 = above1*inverse1;
-            const double t10 = 0.5*t8;
-            const double t11 = 0.5*t9;
-            const double value = C0 - hh0*l*r0*r0*(1.0 + t10) - hh1*l*r1*r1*(1.0 - t10) - hh2*l*r2*r2*(1.0 + t11) - hh3*l*r3*r3*(1.0 - t11);
-            const double high_new = (value > 0.0 ? high : l);
-            const double low_new = (value > 0.0 ? l : low);
-            const double step = value/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
-            const double t12 = l + step;
-            const double moved = ((high_new - t12)*(low_new - t12) > 0.0 ? 0.5*high_new + 0.5*low_new : t12);
-            const double t13 = moved - l;
-            l = moved;
-            low = low_new;
-            high = high_new;
-            change = t13;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
         }
         {
             const double t8 = l*s0;
             const double below0 = 1.0 - t8;
             const double above0 = 1.0 + t8;
-            const double inverse0 = 1.0/(above0*below0);
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
             const double r0 = below0*inverse0;
             const double r1 = above0*inverse0;
-            const double t9 = l*s1;
-            const double below1 = 1.0 - t9;
-            const double above1 = 1.0 + t9;
-            const double inverse1 = 1.0/(above1*below1);
+            const double inverse1 = inverse*pair0;
             const double r2 = below1*inverse1;
             const double r3 = above1*inverse1;
-            const double t10 = 0.5*t8;
-            const double t11 = 0.5*t9;
-            const double value = C0 - hh0*l*r0*r0*(1.0 + t10) - hh1*l*r1*r1*(1.0 - t10) - hh2*l*r2*r2*(1.0 + t11) - hh3*l*r3*r3*(1.0 - t11);
-            const double high_new = (value > 0.0 ? high : l);
-            const double low_new = (value > 0.0 ? l : low);
-            const double step = value/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
-            const double t12 = l + step;
-            const double moved = ((high_new - t12)*(low_new - t12) > 0.0 ? 0.5*high_new + 0.5*low_new : t12);
-            const double t13 = moved - l;
-            l = moved;
-            low = low_new;
-            high = high_new;
-            change = t13;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
         }
-        const double t14 = l*s0;
-        const double below0 = 1.0 - t14;
-        const double above0 = 1.0 + t14;
-        const double inverse0 = 1.0/(above0*below0);
+        const double last = (0.9999999999999858 - s0*fabs(l) > 0.0 ? change : l);
+        const double t11 = l*s0;
+        const double below0 = 1.0 - t11;
+        const double above0 = 1.0 + t11;
+        const double pair0 = above0*below0;
+        const double t12 = l*s1;
+        const double above1 = 1.0 + t12;
+        const double below1 = 1.0 - t12;
+        const double pair1 = above1*below1;
+        const double inverse = 1.0/(pair0*pair1);
+        const double inverse0 = inverse*pair1;
         const double r0 = below0*inverse0;
         const double r1 = above0*inverse0;
-        const double t15 = l*s1;
-        const double below1 = 1.0 - t15;
-        const double above1 = 1.0 + t15;
-        const double inverse1 = 1.0/(above1*below1);
+        const double inverse1 = inverse*pair0;
         const double r2 = below1*inverse1;
         const double r3 = above1*inverse1;
         multiplier[i] = l;
-        last_change[i] = change;
+        last_change[i] = last;
+        d[i] = l*sqrt(hh0*r0*r0 + hh1*r1*r1 + hh2*r2*r2 + hh3*r3*r3);
+    }
+}
+
+/* Formula: multiplier l of the foot point by 8 passes of Newton from the Sampson correction,
+   its last change, and the signed distance d = l |n|; each match with its own frame.
+   Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,)
+   Outputs: multiplier (), last_change (), d ()
+   Operations: 500, temporaries: 53. */
+EG_EXPORT void eg_foot_point_more_each(
+    ptrdiff_t n,
+    const double *EG_RESTRICT R1,
+    const double *EG_RESTRICT R2,
+    const double *EG_RESTRICT s,
+    const double *EG_RESTRICT b1,
+    const double *EG_RESTRICT b2,
+    const double *EG_RESTRICT f_array,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    double *EG_RESTRICT multiplier,
+    double *EG_RESTRICT last_change,
+    double *EG_RESTRICT d)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double R1_00 = R1[i];
+        const double R1_01 = R1[n + i];
+        const double R1_10 = R1[2*n + i];
+        const double R1_11 = R1[3*n + i];
+        const double R2_00 = R2[i];
+        const double R2_01 = R2[n + i];
+        const double R2_10 = R2[2*n + i];
+        const double R2_11 = R2[3*n + i];
+        const double s0 = s[i];
+        const double s1 = s[n + i];
+        const double b1_0 = b1[i];
+        const double b1_1 = b1[n + i];
+        const double b2_0 = b2[i];
+        const double b2_1 = b2[n + i];
+        const double f = f_array[i];
+        const double q1_0 = q1[i];
+        const double q1_1 = q1[n + i];
+        const double q2_0 = q2[i];
+        const double q2_1 = q2[n + i];
+        const double a1_0 = R1_00*q1_0 + R1_10*q1_1;
+        const double a1_1 = R1_01*q1_0 + R1_11*q1_1;
+        const double a2_0 = R2_00*q2_0 + R2_10*q2_1;
+        const double a2_1 = R2_01*q2_0 + R2_11*q2_1;
+        const double t0 = b1_0 + a2_0*s0;
+        const double t1 = b1_1 + a2_1*s1;
+        const double C0 = f + a1_0*t0 + a1_1*t1 + a2_0*b2_0 + a2_1*b2_1;
+        const double t2 = b2_0 + a1_0*s0;
+        const double t4 = t0 + t2;
+        const double hh0 = 0.5*t4*t4;
+        const double t5 = b1_0 + a2_0*s0 - t2;
+        const double hh1 = 0.5*t5*t5;
+        const double t3 = b2_1 + a1_1*s1;
+        const double t6 = t1 + t3;
+        const double hh2 = 0.5*t6*t6;
+        const double t7 = b1_1 + a2_1*s1 - t3;
+        const double hh3 = 0.5*t7*t7;
+        const double start = C0/(1e-300 + hh0 + hh1 + hh2 + hh3);
+        double l = start;
+        double change = 0.0;
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        {
+            const double t8 = l*s0;
+            const double below0 = 1.0 - t8;
+            const double above0 = 1.0 + t8;
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
+            const double r0 = below0*inverse0;
+            const double r1 = above0*inverse0;
+            const double inverse1 = inverse*pair0;
+            const double r2 = below1*inverse1;
+            const double r3 = above1*inverse1;
+            const double newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
+            const double t10 = l + newton;
+            l = t10;
+            change = newton;
+        }
+        const double last = (0.9999999999999858 - s0*fabs(l) > 0.0 ? change : l);
+        const double t11 = l*s0;
+        const double below0 = 1.0 - t11;
+        const double above0 = 1.0 + t11;
+        const double pair0 = above0*below0;
+        const double t12 = l*s1;
+        const double above1 = 1.0 + t12;
+        const double below1 = 1.0 - t12;
+        const double pair1 = above1*below1;
+        const double inverse = 1.0/(pair0*pair1);
+        const double inverse0 = inverse*pair1;
+        const double r0 = below0*inverse0;
+        const double r1 = above0*inverse0;
+        const double inverse1 = inverse*pair0;
+        const double r2 = below1*inverse1;
+        const double r3 = above1*inverse1;
+        multiplier[i] = l;
+        last_change[i] = last;
         d[i] = l*sqrt(hh0*r0*r0 + hh1*r1*r1 + hh2*r2*r2 + hh3*r3*r3);
     }
 }
@@ -549,7 +1034,7 @@ EG_EXPORT void eg_foot_point_each(
    frame.
    Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,)
    Outputs: multiplier (), last_change (), d ()
-   Operations: 6488, temporaries: 56. */
+   Operations: 6290, temporaries: 60. */
 EG_EXPORT void eg_foot_point_safe_each(
     ptrdiff_t n,
     const double *EG_RESTRICT R1,
@@ -611,39 +1096,43 @@ EG_EXPORT void eg_foot_point_safe_each(
             const double t8 = l*s0;
             const double below0 = 1.0 - t8;
             const double above0 = 1.0 + t8;
-            const double inverse0 = 1.0/(above0*below0);
+            const double pair0 = above0*below0;
+            const double t9 = l*s1;
+            const double above1 = 1.0 + t9;
+            const double below1 = 1.0 - t9;
+            const double pair1 = above1*below1;
+            const double inverse = 1.0/(pair0*pair1);
+            const double inverse0 = inverse*pair1;
             const double r0 = below0*inverse0;
             const double r1 = above0*inverse0;
-            const double t9 = l*s1;
-            const double below1 = 1.0 - t9;
-            const double above1 = 1.0 + t9;
-            const double inverse1 = 1.0/(above1*below1);
+            const double inverse1 = inverse*pair0;
             const double r2 = below1*inverse1;
             const double r3 = above1*inverse1;
-            const double t10 = 0.5*t8;
-            const double t11 = 0.5*t9;
-            const double value = C0 - hh0*l*r0*r0*(1.0 + t10) - hh1*l*r1*r1*(1.0 - t10) - hh2*l*r2*r2*(1.0 + t11) - hh3*l*r3*r3*(1.0 - t11);
+            const double value = C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3);
             const double high_new = (value > 0.0 ? high : l);
             const double low_new = (value > 0.0 ? l : low);
             const double step = value/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3);
-            const double t12 = l + step;
-            const double moved = ((high_new - t12)*(low_new - t12) > 0.0 ? 0.5*high_new + 0.5*low_new : t12);
-            const double t13 = moved - l;
+            const double t10 = l + step;
+            const double moved = ((high_new - t10)*(low_new - t10) > 0.0 ? 0.5*high_new + 0.5*low_new : t10);
+            const double t11 = moved - l;
             l = moved;
             low = low_new;
             high = high_new;
-            change = t13;
+            change = t11;
         }
-        const double t14 = l*s0;
-        const double below0 = 1.0 - t14;
-        const double above0 = 1.0 + t14;
-        const double inverse0 = 1.0/(above0*below0);
+        const double t12 = l*s0;
+        const double below0 = 1.0 - t12;
+        const double above0 = 1.0 + t12;
+        const double pair0 = above0*below0;
+        const double t13 = l*s1;
+        const double above1 = 1.0 + t13;
+        const double below1 = 1.0 - t13;
+        const double pair1 = above1*below1;
+        const double inverse = 1.0/(pair0*pair1);
+        const double inverse0 = inverse*pair1;
         const double r0 = below0*inverse0;
         const double r1 = above0*inverse0;
-        const double t15 = l*s1;
-        const double below1 = 1.0 - t15;
-        const double above1 = 1.0 + t15;
-        const double inverse1 = 1.0/(above1*below1);
+        const double inverse1 = inverse*pair0;
         const double r2 = below1*inverse1;
         const double r3 = above1*inverse1;
         multiplier[i] = l;
@@ -656,7 +1145,7 @@ EG_EXPORT void eg_foot_point_safe_each(
    distance (envelope theorem); each match with its own frame.
    Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,), l ()
    Outputs: q1_hat (2,), q2_hat (2,), dd_dF (9,)
-   Operations: 101, temporaries: 40. */
+   Operations: 103, temporaries: 43. */
 EG_EXPORT void eg_foot_point_derivative_each(
     ptrdiff_t n,
     const double *EG_RESTRICT R1,
@@ -698,8 +1187,14 @@ EG_EXPORT void eg_foot_point_derivative_each(
         const double a2_1 = R2_01*q2_0 + R2_11*q2_1;
         const double t1 = l*s1;
         const double below1 = 1.0 - t1;
+        const double t0 = l*s0;
+        const double above0 = 1.0 + t0;
+        const double below0 = 1.0 - t0;
+        const double pair0 = above0*below0;
         const double above1 = 1.0 + t1;
-        const double inverse1 = 1.0/(above1*below1);
+        const double pair1 = above1*below1;
+        const double inverse = 1.0/(pair0*pair1);
+        const double inverse1 = inverse*pair0;
         const double r2 = below1*inverse1;
         const double t3 = 0.5*sqrt(2.0);
         const double t9 = b2_1 + a1_1*s1;
@@ -711,10 +1206,7 @@ EG_EXPORT void eg_foot_point_derivative_each(
         const double t13 = a1_1 - t12*t7;
         const double a1_0 = R1_00*q1_0 + R1_10*q1_1;
         const double a2_0 = R2_00*q2_0 + R2_10*q2_1;
-        const double t0 = l*s0;
-        const double below0 = 1.0 - t0;
-        const double above0 = 1.0 + t0;
-        const double inverse0 = 1.0/(above0*below0);
+        const double inverse0 = inverse*pair1;
         const double r0 = below0*inverse0;
         const double t2 = b2_0 + a1_0*s0;
         const double t4 = r0*t3*(b1_0 + t2 + a2_0*s0);
@@ -755,7 +1247,7 @@ EG_EXPORT void eg_foot_point_derivative_each(
    Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
    f () shared, q1 (2,), q2 (2,), l (), weight ()
    Outputs: g (9,) summed, N (45,) summed
-   Operations: 126, temporaries: 60. */
+   Operations: 128, temporaries: 63. */
 EG_EXPORT void eg_reprojection_gauss_newton(
     ptrdiff_t n,
     const double *EG_RESTRICT R1,
@@ -806,18 +1298,12 @@ EG_EXPORT void eg_reprojection_gauss_newton(
     double sum_N8 = 0.0;
     double sum_N9 = 0.0;
     double sum_N10 = 0.0;
-    double sum_N11 = 0.0;
     double sum_N12 = 0.0;
     double sum_N13 = 0.0;
-    double sum_N14 = 0.0;
     double sum_N15 = 0.0;
     double sum_N16 = 0.0;
     double sum_N17 = 0.0;
-    double sum_N18 = 0.0;
-    double sum_N19 = 0.0;
     double sum_N20 = 0.0;
-    double sum_N21 = 0.0;
-    double sum_N22 = 0.0;
     double sum_N23 = 0.0;
     double sum_N24 = 0.0;
     double sum_N25 = 0.0;
@@ -827,12 +1313,9 @@ EG_EXPORT void eg_reprojection_gauss_newton(
     double sum_N29 = 0.0;
     double sum_N30 = 0.0;
     double sum_N31 = 0.0;
-    double sum_N32 = 0.0;
     double sum_N33 = 0.0;
     double sum_N34 = 0.0;
     double sum_N35 = 0.0;
-    double sum_N36 = 0.0;
-    double sum_N37 = 0.0;
     double sum_N38 = 0.0;
     double sum_N39 = 0.0;
     double sum_N40 = 0.0;
@@ -841,7 +1324,7 @@ EG_EXPORT void eg_reprojection_gauss_newton(
     double sum_N43 = 0.0;
     double sum_N44 = 0.0;
 #ifndef _MSC_VER
-#pragma omp simd reduction(+ : sum_g0, sum_g1, sum_g2, sum_g3, sum_g4, sum_g5, sum_g6, sum_g7, sum_g8, sum_N0, sum_N1, sum_N2, sum_N3, sum_N4, sum_N5, sum_N6, sum_N7, sum_N8, sum_N9, sum_N10, sum_N11, sum_N12, sum_N13, sum_N14, sum_N15, sum_N16, sum_N17, sum_N18, sum_N19, sum_N20, sum_N21, sum_N22, sum_N23, sum_N24, sum_N25, sum_N26, sum_N27, sum_N28, sum_N29, sum_N30, sum_N31, sum_N32, sum_N33, sum_N34, sum_N35, sum_N36, sum_N37, sum_N38, sum_N39, sum_N40, sum_N41, sum_N42, sum_N43, sum_N44)
+#pragma omp simd reduction(+ : sum_g0, sum_g1, sum_g2, sum_g3, sum_g4, sum_g5, sum_g6, sum_g7, sum_g8, sum_N0, sum_N1, sum_N2, sum_N3, sum_N4, sum_N5, sum_N6, sum_N7, sum_N8, sum_N9, sum_N10, sum_N12, sum_N13, sum_N15, sum_N16, sum_N17, sum_N20, sum_N23, sum_N24, sum_N25, sum_N26, sum_N27, sum_N28, sum_N29, sum_N30, sum_N31, sum_N33, sum_N34, sum_N35, sum_N38, sum_N39, sum_N40, sum_N41, sum_N42, sum_N43, sum_N44)
 #endif
     for (ptrdiff_t i = 0; i < n; ++i) {
         const double q1_0 = q1[i];
@@ -856,7 +1339,13 @@ EG_EXPORT void eg_reprojection_gauss_newton(
         const double t0 = l*s0;
         const double below0 = 1.0 - t0;
         const double above0 = 1.0 + t0;
-        const double inverse0 = 1.0/(above0*below0);
+        const double pair0 = above0*below0;
+        const double t1 = l*s1;
+        const double above1 = 1.0 + t1;
+        const double below1 = 1.0 - t1;
+        const double pair1 = above1*below1;
+        const double inverse = 1.0/(pair0*pair1);
+        const double inverse0 = inverse*pair1;
         const double r0 = below0*inverse0;
         const double t2 = b2_0 + a1_0*s0;
         const double t4 = r0*t3*(b1_0 + t2 + a2_0*s0);
@@ -870,10 +1359,7 @@ EG_EXPORT void eg_reprojection_gauss_newton(
         const double t14 = p2_0*t13;
         const double a1_1 = R1_01*q1_0 + R1_11*q1_1;
         const double a2_1 = R2_01*q2_0 + R2_11*q2_1;
-        const double t1 = l*s1;
-        const double below1 = 1.0 - t1;
-        const double above1 = 1.0 + t1;
-        const double inverse1 = 1.0/(above1*below1);
+        const double inverse1 = inverse*pair0;
         const double r2 = below1*inverse1;
         const double t7 = b2_1 + a1_1*s1;
         const double t8 = r2*t3*(b1_1 + t7 + a2_1*s1);
@@ -930,18 +1416,12 @@ EG_EXPORT void eg_reprojection_gauss_newton(
         sum_N8 += t22;
         sum_N9 += t18*t26;
         sum_N10 += p1_1*t18;
-        sum_N11 += t24;
         sum_N12 += p2_1*t27;
         sum_N13 += t29;
-        sum_N14 += t25;
         sum_N15 += t27;
         sum_N16 += t28;
         sum_N17 += t18;
-        sum_N18 += t23;
-        sum_N19 += t29;
         sum_N20 += p2_1*t20;
-        sum_N21 += t22;
-        sum_N22 += t28;
         sum_N23 += t20;
         sum_N24 += t16*t30;
         sum_N25 += p1_1*t31;
@@ -951,12 +1431,9 @@ EG_EXPORT void eg_reprojection_gauss_newton(
         sum_N29 += t33;
         sum_N30 += t26*t30;
         sum_N31 += p1_1*t30;
-        sum_N32 += t34;
         sum_N33 += t26*t32;
         sum_N34 += t35;
         sum_N35 += t30;
-        sum_N36 += t33;
-        sum_N37 += t35;
         sum_N38 += t32;
         sum_N39 += t16*t17;
         sum_N40 += p1_1*t36;
@@ -985,18 +1462,18 @@ EG_EXPORT void eg_reprojection_gauss_newton(
     N[8] = sum_N8;
     N[9] = sum_N9;
     N[10] = sum_N10;
-    N[11] = sum_N11;
+    N[11] = sum_N4;
     N[12] = sum_N12;
     N[13] = sum_N13;
-    N[14] = sum_N14;
+    N[14] = sum_N7;
     N[15] = sum_N15;
     N[16] = sum_N16;
     N[17] = sum_N17;
-    N[18] = sum_N18;
-    N[19] = sum_N19;
+    N[18] = sum_N5;
+    N[19] = sum_N13;
     N[20] = sum_N20;
-    N[21] = sum_N21;
-    N[22] = sum_N22;
+    N[21] = sum_N8;
+    N[22] = sum_N16;
     N[23] = sum_N23;
     N[24] = sum_N24;
     N[25] = sum_N25;
@@ -1006,12 +1483,12 @@ EG_EXPORT void eg_reprojection_gauss_newton(
     N[29] = sum_N29;
     N[30] = sum_N30;
     N[31] = sum_N31;
-    N[32] = sum_N32;
+    N[32] = sum_N28;
     N[33] = sum_N33;
     N[34] = sum_N34;
     N[35] = sum_N35;
-    N[36] = sum_N36;
-    N[37] = sum_N37;
+    N[36] = sum_N29;
+    N[37] = sum_N34;
     N[38] = sum_N38;
     N[39] = sum_N39;
     N[40] = sum_N40;
@@ -1021,12 +1498,12 @@ EG_EXPORT void eg_reprojection_gauss_newton(
     N[44] = sum_N44;
 }
 
-/* Formula: gradient and exact Hessian (upper triangle) of a robust sum of d^2 / 2 by vect(F)
-   of the rotated images, from H = l C_FF - R^T K^-1 R for each match.
+/* Formula: gradient, Gauss-Newton matrix and exact Hessian (upper triangles) of a robust sum
+   of d^2 / 2 by vect(F) of the rotated images, H = l C_FF - R^T K^-1 R for each match.
    Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
    f () shared, q1 (2,), q2 (2,), l (), weight (), curvature ()
-   Outputs: g (9,) summed, H (45,) summed
-   Operations: 396, temporaries: 119. */
+   Outputs: g (9,) summed, N (45,) summed, H (45,) summed
+   Operations: 442, temporaries: 143. */
 EG_EXPORT void eg_reprojection_newton(
     ptrdiff_t n,
     const double *EG_RESTRICT R1,
@@ -1041,6 +1518,7 @@ EG_EXPORT void eg_reprojection_newton(
     const double *EG_RESTRICT weight_array,
     const double *EG_RESTRICT curvature_array,
     double *EG_RESTRICT g,
+    double *EG_RESTRICT N,
     double *EG_RESTRICT H)
 {
     const double R1_00 = R1[0];
@@ -1067,6 +1545,42 @@ EG_EXPORT void eg_reprojection_newton(
     double sum_g6 = 0.0;
     double sum_g7 = 0.0;
     double sum_g8 = 0.0;
+    double sum_N0 = 0.0;
+    double sum_N1 = 0.0;
+    double sum_N2 = 0.0;
+    double sum_N3 = 0.0;
+    double sum_N4 = 0.0;
+    double sum_N5 = 0.0;
+    double sum_N6 = 0.0;
+    double sum_N7 = 0.0;
+    double sum_N8 = 0.0;
+    double sum_N9 = 0.0;
+    double sum_N10 = 0.0;
+    double sum_N12 = 0.0;
+    double sum_N13 = 0.0;
+    double sum_N15 = 0.0;
+    double sum_N16 = 0.0;
+    double sum_N17 = 0.0;
+    double sum_N20 = 0.0;
+    double sum_N23 = 0.0;
+    double sum_N24 = 0.0;
+    double sum_N25 = 0.0;
+    double sum_N26 = 0.0;
+    double sum_N27 = 0.0;
+    double sum_N28 = 0.0;
+    double sum_N29 = 0.0;
+    double sum_N30 = 0.0;
+    double sum_N31 = 0.0;
+    double sum_N33 = 0.0;
+    double sum_N34 = 0.0;
+    double sum_N35 = 0.0;
+    double sum_N38 = 0.0;
+    double sum_N39 = 0.0;
+    double sum_N40 = 0.0;
+    double sum_N41 = 0.0;
+    double sum_N42 = 0.0;
+    double sum_N43 = 0.0;
+    double sum_N44 = 0.0;
     double sum_H0 = 0.0;
     double sum_H1 = 0.0;
     double sum_H2 = 0.0;
@@ -1113,7 +1627,7 @@ EG_EXPORT void eg_reprojection_newton(
     double sum_H43 = 0.0;
     double sum_H44 = 0.0;
 #ifndef _MSC_VER
-#pragma omp simd reduction(+ : sum_g0, sum_g1, sum_g2, sum_g3, sum_g4, sum_g5, sum_g6, sum_g7, sum_g8, sum_H0, sum_H1, sum_H2, sum_H3, sum_H4, sum_H5, sum_H6, sum_H7, sum_H8, sum_H9, sum_H10, sum_H11, sum_H12, sum_H13, sum_H14, sum_H15, sum_H16, sum_H17, sum_H18, sum_H19, sum_H20, sum_H21, sum_H22, sum_H23, sum_H24, sum_H25, sum_H26, sum_H27, sum_H28, sum_H29, sum_H30, sum_H31, sum_H32, sum_H33, sum_H34, sum_H35, sum_H36, sum_H37, sum_H38, sum_H39, sum_H40, sum_H41, sum_H42, sum_H43, sum_H44)
+#pragma omp simd reduction(+ : sum_g0, sum_g1, sum_g2, sum_g3, sum_g4, sum_g5, sum_g6, sum_g7, sum_g8, sum_N0, sum_N1, sum_N2, sum_N3, sum_N4, sum_N5, sum_N6, sum_N7, sum_N8, sum_N9, sum_N10, sum_N12, sum_N13, sum_N15, sum_N16, sum_N17, sum_N20, sum_N23, sum_N24, sum_N25, sum_N26, sum_N27, sum_N28, sum_N29, sum_N30, sum_N31, sum_N33, sum_N34, sum_N35, sum_N38, sum_N39, sum_N40, sum_N41, sum_N42, sum_N43, sum_N44, sum_H0, sum_H1, sum_H2, sum_H3, sum_H4, sum_H5, sum_H6, sum_H7, sum_H8, sum_H9, sum_H10, sum_H11, sum_H12, sum_H13, sum_H14, sum_H15, sum_H16, sum_H17, sum_H18, sum_H19, sum_H20, sum_H21, sum_H22, sum_H23, sum_H24, sum_H25, sum_H26, sum_H27, sum_H28, sum_H29, sum_H30, sum_H31, sum_H32, sum_H33, sum_H34, sum_H35, sum_H36, sum_H37, sum_H38, sum_H39, sum_H40, sum_H41, sum_H42, sum_H43, sum_H44)
 #endif
     for (ptrdiff_t i = 0; i < n; ++i) {
         const double q1_0 = q1[i];
@@ -1132,7 +1646,15 @@ EG_EXPORT void eg_reprojection_newton(
         const double below0 = -t2;
         const double t1 = 1.0 + t0;
         const double above0 = t1;
-        const double inverse0 = 1.0/(above0*below0);
+        const double pair0 = above0*below0;
+        const double t3 = l*s1;
+        const double t4 = 1.0 + t3;
+        const double above1 = t4;
+        const double t5 = t3 - 1.0;
+        const double below1 = -t5;
+        const double pair1 = above1*below1;
+        const double inverse = 1.0/(pair0*pair1);
+        const double inverse0 = inverse*pair1;
         const double r0 = below0*inverse0;
         const double t6 = b2_0 + a1_0*s0;
         const double t8 = r0*t7*(b1_0 + t6 + a2_0*s0);
@@ -1145,12 +1667,7 @@ EG_EXPORT void eg_reprojection_newton(
         const double t18 = p1_0*p2_0;
         const double a1_1 = R1_01*q1_0 + R1_11*q1_1;
         const double a2_1 = R2_01*q2_0 + R2_11*q2_1;
-        const double t3 = l*s1;
-        const double t5 = t3 - 1.0;
-        const double below1 = -t5;
-        const double t4 = 1.0 + t3;
-        const double above1 = t4;
-        const double inverse1 = 1.0/(above1*below1);
+        const double inverse1 = inverse*pair0;
         const double r2 = below1*inverse1;
         const double t11 = b2_1 + a1_1*s1;
         const double t12 = r2*t7*(b1_1 + t11 + a2_1*s1);
@@ -1165,83 +1682,104 @@ EG_EXPORT void eg_reprojection_newton(
         const double t21 = p1_1*p2_1;
         const double t22 = p1_0*p1_0;
         const double t23 = p2_0*p2_0;
-        const double t24 = l*l;
-        const double t25 = curvature*t24;
-        const double t26 = t23*t25;
-        const double t27 = 1.0/(t1*t2);
-        const double t28 = t24*t27;
-        const double t29 = p1_0*t28;
-        const double t30 = l*l*l;
-        const double t31 = s0*t27*t30;
-        const double t32 = p2_0*t31;
-        const double t33 = t32 - t29;
-        const double t34 = p2_0*t28;
-        const double t35 = p1_0*t31;
-        const double t36 = t35 - t34;
-        const double n2 = t15;
-        const double t37 = n2*t27;
         const double n0 = t10;
-        const double t38 = n0*t27;
-        const double t39 = t0*t38 - t37;
-        const double t40 = l*t39;
-        const double t41 = t0*t37 - t38;
-        const double t42 = l*t41;
-        const double t43 = p1_0*p2_0 - p1_0*t40 - p2_0*t42;
         const double n1 = t14;
+        const double n2 = t15;
         const double n3 = t16;
-        const double t44 = 1.0/(t4*t5);
-        const double t45 = n1*t44;
-        const double t46 = n3*t44;
-        const double t47 = t3*t46 - t45;
-        const double t48 = t3*t45 - t46;
-        const double t49 = 1.0/(n0*t41 + n1*t47 + n2*t39 + n3*t48);
-        const double t50 = p1_0*t26;
-        const double t51 = l*t47;
-        const double t52 = p1_1*p2_0 - p1_1*t40 - p2_0*t51;
-        const double t53 = p2_0 - t40;
-        const double t54 = t43*t49;
-        const double t55 = p2_0*t25;
-        const double t56 = t22*t55;
-        const double t57 = l*t48;
-        const double t58 = p1_0*p2_1 - p1_0*t57 - p2_1*t42;
-        const double t59 = t18*t25;
-        const double t60 = t21*t59;
-        const double t61 = p1_1*p2_1 - p1_1*t57 - p2_1*t51;
-        const double t62 = t49*weight;
-        const double t63 = t43*t62;
-        const double t64 = p2_1*t25;
-        const double t65 = t18*t64;
-        const double t66 = p2_1 - t57;
-        const double t67 = p1_0 - t42;
-        const double t68 = p1_1*t25;
-        const double t69 = t18*t68;
-        const double t70 = p1_1 - t51;
-        const double t71 = p1_1*p1_1;
-        const double t72 = t24*t44;
-        const double t73 = t49*t52;
-        const double t74 = s1*t30*t44;
-        const double t75 = t55*t71;
-        const double t76 = p2_0*t72;
-        const double t77 = t19*t64;
-        const double t78 = t19*t25;
-        const double t79 = t53*t62;
-        const double t80 = p2_1*p2_1;
-        const double t81 = t25*t80;
-        const double t82 = p1_0*t81;
-        const double t83 = p1_0*t72;
-        const double t84 = t49*t58;
-        const double t85 = t20*t68;
-        const double t86 = t20*t25;
-        const double t87 = p1_1*t72;
-        const double t88 = p2_1*t74;
-        const double t89 = p2_1*t72;
-        const double t90 = p1_1*t74;
-        const double t91 = t49*t61;
-        const double t92 = t61*t62;
-        const double t93 = t21*t25;
-        const double t94 = t62*t66;
-        const double t95 = p1_0*t25;
-        const double t96 = t62*t67;
+        const double length2 = 1e-300 + n0*n0 + n1*n1 + n2*n2 + n3*n3;
+        const double t24 = weight/length2;
+        const double t25 = t23*t24;
+        const double t26 = p1_0*t25;
+        const double t27 = p2_0*t24;
+        const double t28 = t22*t27;
+        const double t29 = t18*t24;
+        const double t30 = t21*t29;
+        const double t31 = p2_1*t24;
+        const double t32 = t18*t31;
+        const double t33 = p1_1*t24;
+        const double t34 = t18*t33;
+        const double t35 = p1_1*p1_1;
+        const double t36 = t27*t35;
+        const double t37 = t19*t31;
+        const double t38 = t19*t24;
+        const double t39 = p2_1*p2_1;
+        const double t40 = t24*t39;
+        const double t41 = p1_0*t40;
+        const double t42 = t20*t33;
+        const double t43 = t20*t24;
+        const double t44 = t21*t24;
+        const double t45 = p1_0*t24;
+        const double t46 = l*l;
+        const double t47 = curvature*t46;
+        const double t48 = t23*t47;
+        const double t49 = 1.0/(t1*t2);
+        const double t50 = t46*t49;
+        const double t51 = p1_0*t50;
+        const double t52 = l*l*l;
+        const double t53 = s0*t49*t52;
+        const double t54 = p2_0*t53;
+        const double t55 = t54 - t51;
+        const double t56 = p2_0*t50;
+        const double t57 = p1_0*t53;
+        const double t58 = t57 - t56;
+        const double t59 = n2*t49;
+        const double t60 = n0*t49;
+        const double t61 = t0*t60 - t59;
+        const double t62 = l*t61;
+        const double t63 = t0*t59 - t60;
+        const double t64 = l*t63;
+        const double t65 = p1_0*p2_0 - p1_0*t62 - p2_0*t64;
+        const double t66 = 1.0/(t4*t5);
+        const double t67 = n1*t66;
+        const double t68 = n3*t66;
+        const double t69 = t3*t68 - t67;
+        const double t70 = t3*t67 - t68;
+        const double t71 = 1.0/(n0*t63 + n1*t69 + n2*t61 + n3*t70);
+        const double t72 = p1_0*t48;
+        const double t73 = l*t69;
+        const double t74 = p1_1*p2_0 - p1_1*t62 - p2_0*t73;
+        const double t75 = p2_0 - t62;
+        const double t76 = t65*t71;
+        const double t77 = p2_0*t47;
+        const double t78 = t22*t77;
+        const double t79 = l*t70;
+        const double t80 = p1_0*p2_1 - p1_0*t79 - p2_1*t64;
+        const double t81 = t18*t47;
+        const double t82 = t21*t81;
+        const double t83 = p1_1*p2_1 - p1_1*t79 - p2_1*t73;
+        const double t84 = t71*weight;
+        const double t85 = t65*t84;
+        const double t86 = p2_1*t47;
+        const double t87 = t18*t86;
+        const double t88 = p2_1 - t79;
+        const double t89 = p1_0 - t64;
+        const double t90 = p1_1*t47;
+        const double t91 = t18*t90;
+        const double t92 = p1_1 - t73;
+        const double t93 = t46*t66;
+        const double t94 = t71*t74;
+        const double t95 = s1*t52*t66;
+        const double t96 = t35*t77;
+        const double t97 = p2_0*t93;
+        const double t98 = t19*t86;
+        const double t99 = t19*t47;
+        const double t100 = t75*t84;
+        const double t101 = t39*t47;
+        const double t102 = p1_0*t101;
+        const double t103 = p1_0*t93;
+        const double t104 = t71*t80;
+        const double t105 = t20*t90;
+        const double t106 = t20*t47;
+        const double t107 = p1_1*t93;
+        const double t108 = p2_1*t95;
+        const double t109 = p2_1*t93;
+        const double t110 = p1_1*t95;
+        const double t111 = t71*t83;
+        const double t112 = t83*t84;
+        const double t113 = t21*t47;
+        const double t114 = t84*t88;
+        const double t115 = p1_0*t47;
+        const double t116 = t84*t89;
         sum_g0 += t17*t18;
         sum_g1 += t17*t19;
         sum_g2 += p2_0*t17;
@@ -1251,51 +1789,87 @@ EG_EXPORT void eg_reprojection_newton(
         sum_g6 += p1_0*t17;
         sum_g7 += p1_1*t17;
         sum_g8 += t17;
-        sum_H0 += t22*t26 + weight*(t43*t43*t49 - p1_0*t33 - p2_0*t36);
-        sum_H1 += p1_1*t50 + weight*(t43*t49*t52 - p1_1*t33);
-        sum_H2 += t50 + weight*(t29 + t53*t54 - t32);
-        sum_H3 += p2_1*t56 + weight*(t43*t49*t58 - p2_1*t36);
-        sum_H4 += t60 + t61*t63;
-        sum_H5 += t65 + t63*t66;
-        sum_H6 += t56 + weight*(t34 + t54*t67 - t35);
-        sum_H7 += t69 + t63*t70;
-        sum_H8 += t59 + t63;
-        sum_H9 += t26*t71 + weight*(t23*t72 + t28*t71 + t49*t52*t52);
-        sum_H10 += p1_1*t26 + weight*(p1_1*t28 + t53*t73);
-        sum_H11 += t60 + weight*(t49*t52*t58 - t18*t74 - t21*t31);
-        sum_H12 += p2_1*t75 + weight*(p2_1*t76 + t61*t73 - t19*t74);
-        sum_H13 += t77 + weight*(t49*t52*t66 - p2_0*t74);
-        sum_H14 += t69 + weight*(t49*t52*t67 - p1_1*t31);
-        sum_H15 += t75 + weight*(t76 + t70*t73);
-        sum_H16 += t78 + t52*t62;
-        sum_H17 += t26 + weight*(t28 + t49*t53*t53);
-        sum_H18 += t65 + weight*(t49*t53*t58 - p2_1*t31);
-        sum_H19 += t77 + t61*t79;
-        sum_H20 += p2_1*t55 + t66*t79;
-        sum_H21 += t59 + weight*(t49*t53*t67 - t31);
-        sum_H22 += t78 + t70*t79;
-        sum_H23 += t55 + t79;
-        sum_H24 += t22*t81 + weight*(t22*t72 + t28*t80 + t49*t58*t58);
-        sum_H25 += p1_1*t82 + weight*(p1_1*t83 + t61*t84 - t20*t74);
-        sum_H26 += t82 + weight*(t83 + t66*t84);
-        sum_H27 += t22*t64 + weight*(p2_1*t28 + t67*t84);
-        sum_H28 += t85 + weight*(t49*t58*t70 - p1_0*t74);
-        sum_H29 += t86 + t58*t62;
-        sum_H30 += t71*t81 + weight*(t49*t61*t61 - p1_1*(t88 - t87) - p2_1*(t90 - t89));
-        sum_H31 += p1_1*t81 + weight*(t87 + t66*t91 - t88);
-        sum_H32 += t85 + t67*t92;
-        sum_H33 += t64*t71 + weight*(t89 + t70*t91 - t90);
-        sum_H34 += t92 + t93;
-        sum_H35 += t81 + weight*(t72 + t49*t66*t66);
-        sum_H36 += t86 + t67*t94;
-        sum_H37 += t93 + weight*(t49*t66*t70 - t74);
-        sum_H38 += t64 + t94;
-        sum_H39 += t22*t25 + weight*(t28 + t49*t67*t67);
-        sum_H40 += p1_1*t95 + t70*t96;
-        sum_H41 += t95 + t96;
-        sum_H42 += t25*t71 + weight*(t72 + t49*t70*t70);
-        sum_H43 += t68 + t62*t70;
-        sum_H44 += t25 + t62;
+        sum_N0 += t22*t25;
+        sum_N1 += p1_1*t26;
+        sum_N2 += t26;
+        sum_N3 += p2_1*t28;
+        sum_N4 += t30;
+        sum_N5 += t32;
+        sum_N6 += t28;
+        sum_N7 += t34;
+        sum_N8 += t29;
+        sum_N9 += t25*t35;
+        sum_N10 += p1_1*t25;
+        sum_N12 += p2_1*t36;
+        sum_N13 += t37;
+        sum_N15 += t36;
+        sum_N16 += t38;
+        sum_N17 += t25;
+        sum_N20 += p2_1*t27;
+        sum_N23 += t27;
+        sum_N24 += t22*t40;
+        sum_N25 += p1_1*t41;
+        sum_N26 += t41;
+        sum_N27 += t22*t31;
+        sum_N28 += t42;
+        sum_N29 += t43;
+        sum_N30 += t35*t40;
+        sum_N31 += p1_1*t40;
+        sum_N33 += t31*t35;
+        sum_N34 += t44;
+        sum_N35 += t40;
+        sum_N38 += t31;
+        sum_N39 += t22*t24;
+        sum_N40 += p1_1*t45;
+        sum_N41 += t45;
+        sum_N42 += t24*t35;
+        sum_N43 += t33;
+        sum_N44 += t24;
+        sum_H0 += t22*t48 + weight*(t65*t65*t71 - p1_0*t55 - p2_0*t58);
+        sum_H1 += p1_1*t72 + weight*(t65*t71*t74 - p1_1*t55);
+        sum_H2 += t72 + weight*(t51 + t75*t76 - t54);
+        sum_H3 += p2_1*t78 + weight*(t65*t71*t80 - p2_1*t58);
+        sum_H4 += t82 + t83*t85;
+        sum_H5 += t87 + t85*t88;
+        sum_H6 += t78 + weight*(t56 + t76*t89 - t57);
+        sum_H7 += t91 + t85*t92;
+        sum_H8 += t81 + t85;
+        sum_H9 += t35*t48 + weight*(t23*t93 + t35*t50 + t71*t74*t74);
+        sum_H10 += p1_1*t48 + weight*(p1_1*t50 + t75*t94);
+        sum_H11 += t82 + weight*(t71*t74*t80 - t18*t95 - t21*t53);
+        sum_H12 += p2_1*t96 + weight*(p2_1*t97 + t83*t94 - t19*t95);
+        sum_H13 += t98 + weight*(t71*t74*t88 - p2_0*t95);
+        sum_H14 += t91 + weight*(t71*t74*t89 - p1_1*t53);
+        sum_H15 += t96 + weight*(t97 + t92*t94);
+        sum_H16 += t99 + t74*t84;
+        sum_H17 += t48 + weight*(t50 + t71*t75*t75);
+        sum_H18 += t87 + weight*(t71*t75*t80 - p2_1*t53);
+        sum_H19 += t98 + t100*t83;
+        sum_H20 += p2_1*t77 + t100*t88;
+        sum_H21 += t81 + weight*(t71*t75*t89 - t53);
+        sum_H22 += t99 + t100*t92;
+        sum_H23 += t100 + t77;
+        sum_H24 += t101*t22 + weight*(t22*t93 + t39*t50 + t71*t80*t80);
+        sum_H25 += p1_1*t102 + weight*(p1_1*t103 + t104*t83 - t20*t95);
+        sum_H26 += t102 + weight*(t103 + t104*t88);
+        sum_H27 += t22*t86 + weight*(p2_1*t50 + t104*t89);
+        sum_H28 += t105 + weight*(t71*t80*t92 - p1_0*t95);
+        sum_H29 += t106 + t80*t84;
+        sum_H30 += t101*t35 + weight*(t71*t83*t83 - p1_1*(t108 - t107) - p2_1*(t110 - t109));
+        sum_H31 += p1_1*t101 + weight*(t107 + t111*t88 - t108);
+        sum_H32 += t105 + t112*t89;
+        sum_H33 += t35*t86 + weight*(t109 + t111*t92 - t110);
+        sum_H34 += t112 + t113;
+        sum_H35 += t101 + weight*(t93 + t71*t88*t88);
+        sum_H36 += t106 + t114*t89;
+        sum_H37 += t113 + weight*(t71*t88*t92 - t95);
+        sum_H38 += t114 + t86;
+        sum_H39 += t22*t47 + weight*(t50 + t71*t89*t89);
+        sum_H40 += p1_1*t115 + t116*t92;
+        sum_H41 += t115 + t116;
+        sum_H42 += t35*t47 + weight*(t93 + t71*t92*t92);
+        sum_H43 += t90 + t84*t92;
+        sum_H44 += t47 + t84;
     }
     g[0] = sum_g0;
     g[1] = sum_g1;
@@ -1306,6 +1880,51 @@ EG_EXPORT void eg_reprojection_newton(
     g[6] = sum_g6;
     g[7] = sum_g7;
     g[8] = sum_g8;
+    N[0] = sum_N0;
+    N[1] = sum_N1;
+    N[2] = sum_N2;
+    N[3] = sum_N3;
+    N[4] = sum_N4;
+    N[5] = sum_N5;
+    N[6] = sum_N6;
+    N[7] = sum_N7;
+    N[8] = sum_N8;
+    N[9] = sum_N9;
+    N[10] = sum_N10;
+    N[11] = sum_N4;
+    N[12] = sum_N12;
+    N[13] = sum_N13;
+    N[14] = sum_N7;
+    N[15] = sum_N15;
+    N[16] = sum_N16;
+    N[17] = sum_N17;
+    N[18] = sum_N5;
+    N[19] = sum_N13;
+    N[20] = sum_N20;
+    N[21] = sum_N8;
+    N[22] = sum_N16;
+    N[23] = sum_N23;
+    N[24] = sum_N24;
+    N[25] = sum_N25;
+    N[26] = sum_N26;
+    N[27] = sum_N27;
+    N[28] = sum_N28;
+    N[29] = sum_N29;
+    N[30] = sum_N30;
+    N[31] = sum_N31;
+    N[32] = sum_N28;
+    N[33] = sum_N33;
+    N[34] = sum_N34;
+    N[35] = sum_N35;
+    N[36] = sum_N29;
+    N[37] = sum_N34;
+    N[38] = sum_N38;
+    N[39] = sum_N39;
+    N[40] = sum_N40;
+    N[41] = sum_N41;
+    N[42] = sum_N42;
+    N[43] = sum_N43;
+    N[44] = sum_N44;
     H[0] = sum_H0;
     H[1] = sum_H1;
     H[2] = sum_H2;

@@ -19,7 +19,7 @@ class Signature(NamedTuple):
     formula: str
 
 
-C_DIGEST = "90d77f951338b7e8"
+C_DIGEST = "7cc3a5d097e3ac27"
 
 SIGNATURES = {
     "block_derivatives": Signature(
@@ -39,6 +39,48 @@ SIGNATURES = {
         (Argument("U", (3, 3), True), Argument("V", (3, 3), True), Argument("M", (2, 2), True), Argument("delta", (7,), True), ),
         (Argument("U_new", (3, 3), True), Argument("V_new", (3, 3), True), Argument("M_new", (2, 2), True), ),
         "U <- U R(x1, x2, 0), V <- V R(y1, y2, 0), M moved in its tangent plane.",
+    ),
+    "squared_distance": Signature(
+        "bundle",
+        (Argument("P", (3, 4), True), Argument("Q", (4,), True), Argument("q", (2,), True), ),
+        (Argument("squared", (), True), ),
+        "squared distance |q - q_hat|^2 of a projected point to its measurement.",
+    ),
+    "point_normal": Signature(
+        "bundle",
+        (Argument("P", (3, 4), True), Argument("Q", (4,), True), Argument("q", (2,), True), Argument("weight", (), True), ),
+        (Argument("V", (10,), True), Argument("D", (10,), True), Argument("g", (4,), True), Argument("squared", (), True), ),
+        "what an observation adds to its point's normal equations: w J_Q^T J_Q and w Z_Q^T Z_Q (upper triangles; Z = d log depth), -w J_Q^T (q - q_hat), and |q - q_hat|^2.",
+    ),
+    "camera_normal": Signature(
+        "bundle",
+        (Argument("P", (3, 4), True), Argument("Q", (4,), True), Argument("q", (2,), True), Argument("weight", (), True), ),
+        (Argument("A", (6,), True), Argument("depth", (), True), Argument("e", (3,), True), ),
+        "the factors of what an observation adds to its camera's normal equations: J_P^T J_P = A x Q Q^T (A: upper triangle of 3x3, with weight), Z_P^T Z_P = depth Q Q^T for the last row of P and zero for the others, -w J_P^T (q - q_hat) = e x Q.",
+    ),
+    "coupling": Signature(
+        "bundle",
+        (Argument("P", (3, 4), True), Argument("Q", (4,), True), Argument("weight", (), True), Argument("T", (4, 4), True), ),
+        (Argument("Y", (3, 4), True), ),
+        "the factor of camera and point coupled by an observation, w J_P^T J_Q T = Y x Q with Y = w a^T a P T, T a change of the point's parameters.",
+    ),
+    "inverse_root": Signature(
+        "bundle",
+        (Argument("V", (10,), True), ),
+        (Argument("T", (4, 4), True), ),
+        "upper triangular T with T T^T = V^-1, from the upper triangle of V.",
+    ),
+    "damped_inverse_root": Signature(
+        "bundle",
+        (Argument("V", (10,), True), Argument("W", (10,), True), Argument("lam", (), False), ),
+        (Argument("T", (4, 4), True), ),
+        "upper triangular T with T T^T = (V + lam W)^-1, found where W = 1; upper triangles.",
+    ),
+    "point_step": Signature(
+        "bundle",
+        (Argument("V", (10,), True), Argument("W", (10,), True), Argument("g", (4,), True), Argument("lam", (), True), ),
+        (Argument("step", (4,), True), Argument("promised", (), True), ),
+        "a point's own damped step -(V + lam (V + W))^-1 g and the decrease of the cost that it promises at most, g^T (V + lam (V + W))^-1 g; upper triangles.",
     ),
     "project": Signature(
         "camera",
@@ -85,14 +127,14 @@ SIGNATURES = {
     "epipolar_gauss_newton": Signature(
         "criteria",
         (Argument("F", (3, 3), False), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("weight", (), True), ),
-        (Argument("g", (9,), False), Argument("N", (45,), False), ),
-        "gradient and Gauss-Newton matrix (upper triangle) by vect(F) of the weighted sum of squared epipolar residuals, halved.",
+        (Argument("cost", (), False), Argument("g", (9,), False), Argument("N", (45,), False), ),
+        "half the weighted sum of squared epipolar residuals, its gradient and Gauss-Newton matrix (upper triangle) by vect(F).",
     ),
     "epipolar_newton": Signature(
         "criteria",
         (Argument("F", (3, 3), False), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("weight", (), True), Argument("curvature", (), True), ),
-        (Argument("g", (9,), False), Argument("H", (45,), False), ),
-        "gradient and exact Hessian (upper triangle) by vect(F) of a robust sum of squared epipolar residuals, halved.",
+        (Argument("cost", (), False), Argument("g", (9,), False), Argument("N", (45,), False), Argument("H", (45,), False), ),
+        "half the weighted sum of squared epipolar residuals, and by vect(F) the gradient, the Gauss-Newton matrix and exact Hessian (upper triangles) of their robust sum, halved.",
     ),
     "sampson": Signature(
         "criteria",
@@ -103,20 +145,44 @@ SIGNATURES = {
     "sampson_gauss_newton": Signature(
         "criteria",
         (Argument("F", (3, 3), False), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("weight", (), True), ),
-        (Argument("g", (9,), False), Argument("N", (45,), False), ),
-        "gradient and Gauss-Newton matrix (upper triangle) by vect(F) of the weighted sum of squared sampson residuals, halved.",
+        (Argument("cost", (), False), Argument("g", (9,), False), Argument("N", (45,), False), ),
+        "half the weighted sum of squared sampson residuals, its gradient and Gauss-Newton matrix (upper triangle) by vect(F).",
     ),
     "sampson_newton": Signature(
         "criteria",
         (Argument("F", (3, 3), False), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("weight", (), True), Argument("curvature", (), True), ),
-        (Argument("g", (9,), False), Argument("H", (45,), False), ),
-        "gradient and exact Hessian (upper triangle) by vect(F) of a robust sum of squared sampson residuals, halved.",
+        (Argument("cost", (), False), Argument("g", (9,), False), Argument("N", (45,), False), Argument("H", (45,), False), ),
+        "half the weighted sum of squared sampson residuals, and by vect(F) the gradient, the Gauss-Newton matrix and exact Hessian (upper triangles) of their robust sum, halved.",
     ),
     "error_series": Signature(
         "damping",
         (Argument("K", (9,), True), ),
         (Argument("e", (9,), True), ),
         "e truncated at order n = 0..8, e = sum (-1)^(n+1) (1 + n/2) K(n) with K(n) = g^T (W^-1 N)^n W^-1 g (B03 eq. 10).",
+    ),
+    "loss_huber": Signature(
+        "losses",
+        (Argument("squared", (), True), Argument("scale2", (), False), ),
+        (Argument("value", (), True), Argument("first", (), True), Argument("second", (), True), ),
+        "c^2 rho(s / c^2) with its first two derivatives by the squared residual s, and scale2 = c^2: the loss huber.",
+    ),
+    "loss_soft_l1": Signature(
+        "losses",
+        (Argument("squared", (), True), Argument("scale2", (), False), ),
+        (Argument("value", (), True), Argument("first", (), True), Argument("second", (), True), ),
+        "c^2 rho(s / c^2) with its first two derivatives by the squared residual s, and scale2 = c^2: the loss soft_l1.",
+    ),
+    "loss_cauchy": Signature(
+        "losses",
+        (Argument("squared", (), True), Argument("scale2", (), False), ),
+        (Argument("value", (), True), Argument("first", (), True), Argument("second", (), True), ),
+        "c^2 rho(s / c^2) with its first two derivatives by the squared residual s, and scale2 = c^2: the loss cauchy.",
+    ),
+    "loss_truncated": Signature(
+        "losses",
+        (Argument("squared", (), True), Argument("scale2", (), False), ),
+        (Argument("value", (), True), Argument("first", (), True), Argument("second", (), True), ),
+        "c^2 rho(s / c^2) with its first two derivatives by the squared residual s, and scale2 = c^2: the loss truncated.",
     ),
     "maps_000": Signature(
         "maps",
@@ -334,6 +400,12 @@ SIGNATURES = {
         (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
         "F and P' by epipoles with entries 2 of e and 2 of e' and entry 3 of the epipolar transformation frozen to one (MAPS, B&S section 2).",
     ),
+    "pseudo_object_space": Signature(
+        "object_space",
+        (Argument("eta", (), False), Argument("P", (3, 4), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
+        (Argument("r", (4,), True), Argument("J_P", (4, 12), True), Argument("J_X", (4, 3), True), ),
+        "residuals sqrt(1 - eta) (p12 - p3 q) and sqrt(eta) (p12 - q) with (p12, p3) = P (X, 1), and their Jacobians by vect(P) and X (pOSE; J. H. Hong, C. Zach, CVPR 2018).",
+    ),
     "fundamental_from_factors": Signature(
         "orthonormal",
         (Argument("U", (3, 3), True), Argument("V", (3, 3), True), Argument("sigma", (), True), ),
@@ -374,7 +446,13 @@ SIGNATURES = {
         "reprojection",
         (Argument("R1", (2, 2), False), Argument("R2", (2, 2), False), Argument("s", (2,), False), Argument("b1", (2,), False), Argument("b2", (2,), False), Argument("f", (), False), Argument("q1", (2,), True), Argument("q2", (2,), True), ),
         (Argument("multiplier", (), True), Argument("last_change", (), True), Argument("d", (), True), ),
-        "multiplier l of the foot point by 2 passes of bracketed Newton from the Sampson correction, its last change, and the signed distance d = l |n|.",
+        "multiplier l of the foot point by 2 passes of Newton from the Sampson correction, its last change, and the signed distance d = l |n|.",
+    ),
+    "foot_point_more": Signature(
+        "reprojection",
+        (Argument("R1", (2, 2), False), Argument("R2", (2, 2), False), Argument("s", (2,), False), Argument("b1", (2,), False), Argument("b2", (2,), False), Argument("f", (), False), Argument("q1", (2,), True), Argument("q2", (2,), True), ),
+        (Argument("multiplier", (), True), Argument("last_change", (), True), Argument("d", (), True), ),
+        "multiplier l of the foot point by 8 passes of Newton from the Sampson correction, its last change, and the signed distance d = l |n|.",
     ),
     "foot_point_safe": Signature(
         "reprojection",
@@ -392,7 +470,13 @@ SIGNATURES = {
         "reprojection",
         (Argument("R1", (2, 2), True), Argument("R2", (2, 2), True), Argument("s", (2,), True), Argument("b1", (2,), True), Argument("b2", (2,), True), Argument("f", (), True), Argument("q1", (2,), True), Argument("q2", (2,), True), ),
         (Argument("multiplier", (), True), Argument("last_change", (), True), Argument("d", (), True), ),
-        "multiplier l of the foot point by 2 passes of bracketed Newton from the Sampson correction, its last change, and the signed distance d = l |n|; each match with its own frame.",
+        "multiplier l of the foot point by 2 passes of Newton from the Sampson correction, its last change, and the signed distance d = l |n|; each match with its own frame.",
+    ),
+    "foot_point_more_each": Signature(
+        "reprojection",
+        (Argument("R1", (2, 2), True), Argument("R2", (2, 2), True), Argument("s", (2,), True), Argument("b1", (2,), True), Argument("b2", (2,), True), Argument("f", (), True), Argument("q1", (2,), True), Argument("q2", (2,), True), ),
+        (Argument("multiplier", (), True), Argument("last_change", (), True), Argument("d", (), True), ),
+        "multiplier l of the foot point by 8 passes of Newton from the Sampson correction, its last change, and the signed distance d = l |n|; each match with its own frame.",
     ),
     "foot_point_safe_each": Signature(
         "reprojection",
@@ -415,8 +499,8 @@ SIGNATURES = {
     "reprojection_newton": Signature(
         "reprojection",
         (Argument("R1", (2, 2), False), Argument("R2", (2, 2), False), Argument("s", (2,), False), Argument("b1", (2,), False), Argument("b2", (2,), False), Argument("f", (), False), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("l", (), True), Argument("weight", (), True), Argument("curvature", (), True), ),
-        (Argument("g", (9,), False), Argument("H", (45,), False), ),
-        "gradient and exact Hessian (upper triangle) of a robust sum of d^2 / 2 by vect(F) of the rotated images, from H = l C_FF - R^T K^-1 R for each match.",
+        (Argument("g", (9,), False), Argument("N", (45,), False), Argument("H", (45,), False), ),
+        "gradient, Gauss-Newton matrix and exact Hessian (upper triangles) of a robust sum of d^2 / 2 by vect(F) of the rotated images, H = l C_FF - R^T K^-1 R for each match.",
     ),
     "rotation": Signature(
         "rotations",

@@ -18,14 +18,14 @@ import math
 import threading
 from collections.abc import Callable
 from functools import cache
-from importlib import resources
 from typing import Any
 
 import numpy as np
-from epigauge_generated.signatures import C_DIGEST, SIGNATURES, Argument, Signature
+from epigauge_generated.signatures import SIGNATURES, Argument, Signature
 from numpy.typing import NDArray
 
 from epigauge._arguments import as_choice
+from epigauge._library import library
 from epigauge.errors import BackendError
 
 __all__ = ["NAMES", "Table", "available", "backend", "set_backend", "table"]
@@ -40,7 +40,13 @@ _active: str | None = None
 
 
 class Table:
-    """The kernels of one backend as attributes."""
+    """The kernels of one backend as attributes.
+
+    Parameters
+    ----------
+    name : {"c", "numpy", "casadi"}
+        The backend.
+    """
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -53,10 +59,16 @@ class Table:
 
 
 def available() -> dict[str, str | None]:
-    """Return for each backend None where it can be used, else the reason why not."""
+    """Tell which backends can be used here.
+
+    Returns
+    -------
+    dict of str to str or None
+        For each backend None where it can be used, else the reason why not.
+    """
     reasons: dict[str, str | None] = {"numpy": None}
     try:
-        _library()
+        library()
         reasons["c"] = None
     except BackendError as error:
         reasons["c"] = error.reason
@@ -123,7 +135,7 @@ def table(name: str | None = None) -> Table:
     """
     chosen = backend() if name is None else as_choice("backend", name, NAMES)
     if chosen == "c":
-        _library()
+        library()
     elif chosen == "casadi" and available()["casadi"] is not None:
         raise BackendError(chosen, "needs the package casadi", "pip install 'epigauge[casadi]'")
     return _table(chosen)
@@ -174,7 +186,7 @@ def _wrap_numpy(name: str, signature: Signature) -> Kernel:
 
 
 def _wrap_c(name: str, signature: Signature) -> Kernel:
-    function = getattr(_library(), f"eg_{name}")
+    function = getattr(library(), f"eg_{name}")
     function.restype = None
     count = len(signature.inputs) + len(signature.outputs)
     function.argtypes = [ctypes.c_ssize_t] + [ctypes.c_void_p] * count
@@ -236,20 +248,3 @@ def _wrap_casadi(name: str, signature: Signature) -> Kernel:
 def _rows_columns(argument: Argument) -> tuple[int, int]:
     """Return the shape of an argument in CasADi, which knows matrices only."""
     return (argument.shape[0], math.prod(argument.shape[1:])) if argument.shape else (1, 1)
-
-
-@cache
-def _library() -> ctypes.CDLL:
-    """Load the C library and check that it was built from the formulas of this installation."""
-    for entry in resources.files("epigauge_generated.c_backend").iterdir():
-        if entry.name.endswith((".so", ".dll", ".dylib")):
-            with resources.as_file(entry) as path:
-                library = ctypes.CDLL(str(path))
-            library.eg_digest.restype = ctypes.c_char_p
-            if library.eg_digest() == C_DIGEST.encode():
-                return library
-            raise BackendError(
-                "c", "was built from other formulas", "install epigauge again to rebuild it"
-            )
-    remedy = "install a C compiler, then epigauge again"
-    raise BackendError("c", "was not built when epigauge was installed", remedy)

@@ -215,10 +215,13 @@ class Row:
 
 @dataclass(frozen=True)
 class Outcome(Generic[S]):
-    """Where a minimisation ended: state, linear system there, counts, reason and history."""
+    """Where a minimisation ended: state, linear system there, counts, reason and history.
+
+    The compiled loop (`epigauge.two_view.native`) leaves no linear system behind.
+    """
 
     state: S
-    system: System
+    system: System | None
     nfev: int
     njev: int
     nit: int
@@ -239,10 +242,16 @@ def minimize(
 
     Parameters
     ----------
-    problem, damping, schedule, stopping
-        The parts.
-    start : estimate
-        Where to begin.
+    problem : Problem
+        Cost, linearisation and retraction.
+    start : object
+        Where to begin: an estimate of the problem.
+    damping : Damping
+        Turns a linear system and lambda into a step.
+    schedule : Schedule
+        Accepts or rejects the step and gives the next lambda.
+    stopping : Stopping
+        Tolerances and the number of steps allowed.
     callback : callable, optional
         Called with each `Row`; a true return value stops the minimisation.
     scale : float

@@ -313,16 +313,19 @@ def test_criterion_gradient_and_hessian(name, case, robust):
         return (first, 2.0 * second) if robust else (np.ones(COUNT), np.zeros(COUNT))
 
     def gradient(x):
-        return getattr(K, f"{name}_newton")(x, *pair, *weights(x))[0]
+        return getattr(K, f"{name}_newton")(x, *pair, *weights(x))[1]
 
-    g, H = getattr(K, f"{name}_newton")(F, *pair, *weights(F))
+    half, g, normal, H = getattr(K, f"{name}_newton")(F, *pair, *weights(F))
     assert distance(g, central_differences(cost, F, STEP).ravel()) <= TOLERANCE
     assert distance(unpack(H), central_differences(gradient, F, STEP).reshape(9, 9)) <= TOLERANCE
     r, dr_dF = getattr(K, name)(F, *pair)
     weight = weights(F)[0]
     N = np.einsum("kin,kjn,n->ij", dr_dF, dr_dF, weight)
-    got, packed = getattr(K, f"{name}_gauss_newton")(F, *pair, weight)
+    half_too, got, packed = getattr(K, f"{name}_gauss_newton")(F, *pair, weight)
+    assert half == pytest.approx(0.5 * np.sum(weight * r**2), rel=1e-13)
+    assert half_too == pytest.approx(half, rel=1e-14)
     assert distance(unpack(packed), N) <= 1e-13
+    assert distance(normal, packed) <= 1e-14
     assert distance(got, np.einsum("kin,kn,n->i", dr_dF, r, weight)) <= 1e-13
 
 
@@ -387,7 +390,7 @@ def test_reprojection_gradient_and_hessian(case, robust):
 
     def derivatives(x):
         frame, multiplier, d = foot(x, pair)
-        g, H = K.reprojection_newton(*frame, *pair, multiplier, *weights(d))
+        g, _, H = K.reprojection_newton(*frame, *pair, multiplier, *weights(d))
         turn = to_images(frame)
         return turn @ g, turn @ unpack(H) @ turn.T
 
@@ -416,8 +419,9 @@ def test_hessian_is_gauss_newton_where_the_distances_are_zero(case):
     pair = matches(np.random.default_rng(11), F, COUNT, 0.0)
     frame, multiplier, _ = foot(F, pair)
     weight = np.ones(COUNT)
-    _, H = K.reprojection_newton(*frame, *pair, multiplier, weight, np.zeros(COUNT))
+    _, normal, H = K.reprojection_newton(*frame, *pair, multiplier, weight, np.zeros(COUNT))
     _, N = K.reprojection_gauss_newton(*frame, *pair, multiplier, weight)
+    assert distance(normal, N) <= 1e-14
     assert distance(H, N) <= 1e-12
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
+
 import numpy as np
 import pytest
-from epigauge import kernels
+from epigauge import _library, kernels
+from epigauge._library import C_DIGEST
 from epigauge.errors import ArgumentError, BackendError
-from epigauge.kernels import C_DIGEST, SIGNATURES
+from epigauge.kernels import SIGNATURES
 
 Q, P = np.array([1.0, 2.0, 3.0, 0.5]), np.arange(12.0).reshape(3, 4) ** 1.5
 F, X = np.arange(9.0).reshape(3, 3), np.array([[0.5], [-1.0]])
@@ -137,9 +140,9 @@ def test_backend_can_be_chosen_and_a_refused_choice_changes_nothing(monkeypatch)
     assert kernels.backend() == "numpy"
 
 
-def library():
+def loader():
     """Return the loader of the C library without its cache."""
-    return kernels._library.__wrapped__
+    return _library._choose.__wrapped__
 
 
 @pytest.fixture
@@ -150,20 +153,65 @@ def built():
 
 @pytest.mark.usefixtures("built")
 def test_library_carries_the_digest_of_the_formulas():
-    assert library()().eg_digest() == C_DIGEST.encode()
+    assert loader()()[1].eg_digest() == C_DIGEST.encode()
 
 
 @pytest.mark.usefixtures("built")
 def test_library_of_other_formulas_is_refused_with_a_remedy(monkeypatch):
-    monkeypatch.setattr(kernels, "C_DIGEST", "0123456789abcdef")
+    monkeypatch.setattr(_library, "C_DIGEST", "0123456789abcdef")
     with pytest.raises(BackendError, match="other formulas") as error:
-        library()()
+        loader()()
     assert "install" in error.value.remedy
+
+
+@pytest.mark.usefixtures("built")
+@pytest.mark.parametrize("name", _library.LEVELS.values())
+def test_variant_can_be_chosen_and_one_that_cannot_run_is_refused(monkeypatch, name):
+    monkeypatch.setenv("EPIGAUGE_PROCESSOR", name)
+    fastest = _library.library().eg_processor_level()
+    level = next(level for level, known in _library.LEVELS.items() if known == name)
+    if level <= fastest and _library._suffix(level) in _library._files():
+        assert loader()()[0] == name
+    else:
+        with pytest.raises(ArgumentError, match="EPIGAUGE_PROCESSOR"):
+            loader()()
+
+
+@pytest.mark.usefixtures("built")
+def test_unknown_variant_is_refused(monkeypatch):
+    monkeypatch.setenv("EPIGAUGE_PROCESSOR", "x86-64-v9")
+    with pytest.raises(ArgumentError, match="baseline"):
+        loader()()
+
+
+@pytest.mark.usefixtures("built")
+def test_variants_round_arithmetic_alike():
+    """Sums over observations aside, every variant gives the same bits."""
+    rng = np.random.default_rng(5)
+    n = 101
+    P, Q = rng.standard_normal((3, 4, n)), rng.standard_normal((4, n))
+    results = []
+    for path in _library._files().values():
+        try:
+            library = _library._loaded(path)
+        except OSError:
+            continue
+        level = int(path.rpartition("_v")[2][0]) if "_v" in path else 0
+        if level > _library.library().eg_processor_level():
+            continue
+        outputs = np.empty((2, n)), np.empty((2, 12, n)), np.empty((2, 4, n)), np.empty(n)
+        library.eg_project(
+            ctypes.c_ssize_t(n), *(ctypes.c_void_p(a.ctypes.data) for a in (P, Q, *outputs))
+        )
+        results.append(outputs)
+    for outputs in results[1:]:
+        for a, b in zip(outputs, results[0], strict=True):
+            np.testing.assert_array_equal(a, b)
 
 
 def test_install_without_library_is_refused_with_a_remedy(monkeypatch, tmp_path):
     (tmp_path / "__init__.py").write_text("")
-    monkeypatch.setattr(kernels.resources, "files", lambda package: tmp_path)
+    monkeypatch.setattr(_library.resources, "files", lambda package: tmp_path)
     with pytest.raises(BackendError, match="not built") as error:
-        library()()
+        loader()()
     assert "compiler" in error.value.remedy

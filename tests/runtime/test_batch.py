@@ -52,6 +52,16 @@ def test_start_values_and_weights_go_to_their_pairs(ragged):
     np.testing.assert_array_equal(batch.F[1], single.F)
 
 
+def test_flags_are_those_of_single_calls_where_asked_for(ragged):
+    x1, x2, offsets = ragged
+    flags = eg.refine_fundamental_batch(x1, x2, offsets, flags=True).flags
+    single = eg.refine_fundamental(x1[: offsets[1]], x2[: offsets[1]])
+    assert flags[0] == single.flags
+    assert "few matches" in flags[0]
+    assert flags[2] == flags[4] == ()
+    assert eg.refine_fundamental_batch(x1, x2, offsets).flags == ((),) * len(SIZES)
+
+
 def test_progress_counts_to_the_number_of_pairs(ragged):
     calls = []
     eg.refine_fundamental_batch(*ragged, workers=2, progress=lambda *counts: calls.append(counts))

@@ -237,7 +237,7 @@ class TestBackends:
         def missing() -> None:
             raise BackendError("c", "was not built", "install a C compiler")
 
-        monkeypatch.setattr(kernels, "_library", missing)
+        monkeypatch.setattr(kernels, "library", missing)
         without = SimpleNamespace(
             import_module=importlib.import_module,
             util=SimpleNamespace(find_spec=lambda name: None),

@@ -164,8 +164,8 @@ class TestEliminated:
     def test_scale_of_the_parameters_does_not_depend_on_the_hessian(self, kernels, place) -> None:
         newton = self.problem(kernels, place, {}, exact=True)[2]
         gauss = self.problem(kernels, place, {}, exact=False)[2]
-        np.testing.assert_array_equal(newton.diagonal, gauss.diagonal)
-        np.testing.assert_array_equal(newton.gradient, gauss.gradient)
+        assert distance(newton.diagonal, gauss.diagonal) < 1e-14
+        assert distance(newton.gradient, gauss.gradient) < 1e-14
         assert distance(newton.hessian, gauss.hessian) > 1e-4  # there is a second-order term
 
     @pytest.mark.parametrize("place", PLACES)

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import hashlib
 
+import sympy as sp
+
 from epigauge_derive.emitters._text import (
     families,
     file_header,
-    indices,
     kernel_header,
     mostly_zero,
     used_entries,
@@ -22,7 +23,7 @@ from epigauge_derive.printer import Printer
 from epigauge_derive.program import Assignments, Program, Repeat
 
 _printer = Printer(
-    {"sqrt": "sqrt", "sin": "sin", "cos": "cos", "atan2": "atan2", "abs": "fabs"},
+    {"sqrt": "sqrt", "sin": "sin", "cos": "cos", "atan2": "atan2", "abs": "fabs", "log1p": "log1p"},
     select="({condition} > 0.0 ? {then} : {other})",
 )
 
@@ -100,19 +101,14 @@ def _function(program: Program) -> str:
     lines += [f"   {line}" for line in kernel_header(program)[1:]]
     lines[-1] += " */"
     lines += [_prototype(kernel), "{"]
-    sums = [
-        (f"sum_{output.name}{position}", output, position)
-        for output in kernel.outputs
-        if output.summed
-        for position in range(len(indices(output.shape)))
-    ]
+    sums = _sums(program)
     for argument in kernel.inputs:
         if not used_entries(program, argument):
             lines.append(f"    (void){_pointer(argument)};")
         if argument.shared:
             for position, _, name in used_entries(program, argument):
                 lines.append(f"    const double {name} = {_pointer(argument)}[{position}];")
-    for name, _, _ in sums:
+    for name in sums.values():
         lines.append(f"    double {name} = 0.0;")
     for output, results in zip(kernel.outputs, program.results, strict=True):
         if mostly_zero(output, results):
@@ -124,7 +120,7 @@ def _function(program: Program) -> str:
         if isinstance(statement, Repeat)
     )
     if unrolled:
-        lines.append(_pragma([name for name, _, _ in sums]))
+        lines.append(_pragma(list(sums.values())))
     lines.append("    for (ptrdiff_t i = 0; i < n; ++i) {")
     for argument in kernel.inputs:
         if not argument.shared:
@@ -136,15 +132,27 @@ def _function(program: Program) -> str:
         for position, expression in enumerate(results):
             if sparse and expression.is_zero:
                 continue
-            value = _printer(expression)
-            if output.summed:
-                lines.append(f"        sum_{output.name}{position} += {value};")
-            else:
+            if not output.summed:
+                value = _printer(expression)
                 lines.append(f"        {output.name}[{_place(position)}] = {value};")
+    for expression, name in sums.items():
+        lines.append(f"        {name} += {_printer(expression)};")
     lines.append("    }")
-    for name, output, position in sums:
-        lines.append(f"    {output.name}[{position}] = {name};")
+    for output, results in zip(kernel.outputs, program.results, strict=True):
+        if output.summed:
+            for position, expression in enumerate(results):
+                lines.append(f"    {output.name}[{position}] = {sums[expression]};")
     return "\n".join([*lines, "}"]) + "\n"
+
+
+def _sums(program: Program) -> dict[sp.Expr, str]:
+    """Name the accumulator of each summed expression; equal entries share one."""
+    names: dict[sp.Expr, str] = {}
+    for output, results in zip(program.kernel.outputs, program.results, strict=True):
+        if output.summed:
+            for position, expression in enumerate(results):
+                names.setdefault(expression, f"sum_{output.name}{position}")
+    return names
 
 
 def _pragma(sums: list[str]) -> str:

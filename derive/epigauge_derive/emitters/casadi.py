@@ -18,7 +18,14 @@ from epigauge_derive.printer import Printer
 from epigauge_derive.program import Assignments, Program, Repeat
 
 _printer = Printer(
-    {"sqrt": "ca.sqrt", "sin": "ca.sin", "cos": "ca.cos", "atan2": "ca.atan2", "abs": "ca.fabs"},
+    {
+        "sqrt": "ca.sqrt",
+        "sin": "ca.sin",
+        "cos": "ca.cos",
+        "atan2": "ca.atan2",
+        "abs": "ca.fabs",
+        "log1p": "ca.log1p",
+    },
     select="ca.if_else({condition} > 0.0, {then}, {other})",
 )
 

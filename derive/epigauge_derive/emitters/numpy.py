@@ -15,7 +15,14 @@ from epigauge_derive.printer import Printer
 from epigauge_derive.program import Assignments, Program, Repeat
 
 _printer = Printer(
-    {"sqrt": "np.sqrt", "sin": "np.sin", "cos": "np.cos", "atan2": "np.arctan2", "abs": "np.abs"},
+    {
+        "sqrt": "np.sqrt",
+        "sin": "np.sin",
+        "cos": "np.cos",
+        "atan2": "np.arctan2",
+        "abs": "np.abs",
+        "log1p": "np.log1p",
+    },
     select="np.where({condition} > 0.0, {then}, {other})",
 )
 

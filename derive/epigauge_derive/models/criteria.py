@@ -75,20 +75,22 @@ def _normal_equations(name: str, residuals: list[sp.Expr]) -> list[Kernel]:
     exact = weight.symbol() * second + curvature.symbol() * half * half.T
     gradient = Output.of("g", weight.symbol() * half, summed=True)
     normal = Output.of("N", upper(weight.symbol() * gauss_newton), summed=True)
+    squared = sum(r**2 for r in residuals)
+    cost = Output.of("cost", weight.symbol() * squared / 2, summed=True)
     arguments = (F, Q1, Q2, weight)
     return [
         Kernel(
             f"{name}_gauss_newton",
-            f"gradient and Gauss-Newton matrix (upper triangle) by vect(F) of the weighted sum of "
-            f"squared {name} residuals, halved.",
+            f"half the weighted sum of squared {name} residuals, its gradient and Gauss-Newton "
+            "matrix (upper triangle) by vect(F).",
             arguments,
-            (gradient, normal),
+            (cost, gradient, normal),
         ),
         Kernel(
             f"{name}_newton",
-            f"gradient and exact Hessian (upper triangle) by vect(F) of a robust sum of squared "
-            f"{name} residuals, halved.",
+            f"half the weighted sum of squared {name} residuals, and by vect(F) the gradient, the "
+            "Gauss-Newton matrix and exact Hessian (upper triangles) of their robust sum, halved.",
             (*arguments, curvature),
-            (gradient, Output.of("H", upper(exact), summed=True)),
+            (cost, gradient, normal, Output.of("H", upper(exact), summed=True)),
         ),
     ]

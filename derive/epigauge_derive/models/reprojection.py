@@ -18,7 +18,16 @@ from dataclasses import replace
 
 import sympy as sp
 
-from epigauge_derive.kernel import Input, Kernel, Let, Loop, Output, jacobian, select, upper
+from epigauge_derive.kernel import (
+    Input,
+    Kernel,
+    Let,
+    Loop,
+    Output,
+    jacobian,
+    select,
+    upper,
+)
 
 # One evaluation needs F in the rotated images: diag(s), the last column b2, the last row b1, f.
 R1, R2 = Input("R1", (2, 2), shared=True), Input("R2", (2, 2), shared=True)
@@ -30,7 +39,7 @@ Q1, Q2 = Input("q1", (2,)), Input("q2", (2,))
 MULTIPLIER = Input("l")
 
 # Newton passes behind the first, which is the Sampson correction.
-FAST_PASSES, SAFE_PASSES = 2, 100
+FAST_PASSES, MORE_PASSES, SAFE_PASSES = 2, 8, 100
 # The bracket ends this far (relative) inside the poles +-1 / s1, so that nothing divides by zero.
 _INSIDE = 1 - sp.Rational(1, 2**46)
 # Keeps 0/0 out of matches that lie on both epipoles, where C and its gradient vanish together.
@@ -79,41 +88,72 @@ def gradient_at_measurement() -> list[sp.Expr]:
 
 
 def reciprocals(l: sp.Expr) -> dict[sp.Symbol, sp.Expr]:
-    """Name r = 1 / (1 + l kappa) for the four kappa, with one division a pair +-s."""
+    """Name r = 1 / (1 + l kappa) for the four kappa, with one division for all."""
     names: dict[sp.Symbol, sp.Expr] = {}
-    for k, (plus, minus) in enumerate((RECIPROCALS[:2], RECIPROCALS[2:])):
-        above, below, inverse = _symbols(f"above{k}", f"below{k}", f"inverse{k}")
+    pairs = _symbols("pair0", "pair1")
+    inverse = sp.Symbol("inverse", real=True)
+    for k, pair in enumerate(pairs):
+        above, below = _symbols(f"above{k}", f"below{k}")
         names |= {above: 1 + l * KAPPA[2 * k], below: 1 + l * KAPPA[2 * k + 1]}
-        names |= {inverse: 1 / (above * below), plus: below * inverse, minus: above * inverse}
+        names[pair] = above * below
+    names[inverse] = 1 / (pairs[0] * pairs[1])
+    for k, (plus, minus) in enumerate((RECIPROCALS[:2], RECIPROCALS[2:])):
+        above, below = _symbols(f"above{k}", f"below{k}")
+        own = sp.Symbol(f"inverse{k}", real=True)
+        names |= {own: inverse * pairs[1 - k], plus: below * own, minus: above * own}
     return names
 
 
 def secular(l: sp.Expr) -> tuple[sp.Expr, sp.Expr]:
-    """Return phi(l) and -phi'(l) in terms of C0, h^2 and the reciprocals r.
+    """Return phi(l) and -phi'(l) in terms of C0, h^2 and the reciprocals r = 1 / (1 + l kappa).
 
-    phi is C along the stationary curve. Its derivative is -sum h^2 / (1 + l kappa)^3, and
-    integrating from phi(0) = C(z) gives a form without cancellation where kappa vanishes.
+    phi is C along the stationary curve. Its derivative is -sum h^2 r^3, and integrating from
+    phi(0) = C(z) gives sum h^2 l (1 + l kappa / 2) r^2 = (l / 2) sum h^2 r (1 + r), a form without
+    cancellation where kappa vanishes.
     """
-    terms = list(zip(SQUARES, KAPPA, RECIPROCALS, strict=True))
-    slope = sum(h * r**3 for h, _, r in terms)
-    integral = sum(h * l * (1 + l * k / 2) * r**2 for h, k, r in terms)
-    return C0 - integral, slope
+    terms = list(zip(SQUARES, RECIPROCALS, strict=True))
+    slope = sum(h * r * r * r for h, r in terms)
+    return C0 - l / 2 * sum(h * r + h * r * r for h, r in terms), slope
 
 
-def foot_point(passes: int) -> tuple[tuple[Let | Loop, ...], sp.Symbol, sp.Symbol]:
+def _start() -> tuple[Let, sp.Symbol]:
+    """Name C and squared gradient at the measurement, and the Sampson correction."""
+    start = sp.Symbol("start", real=True)
+    names = {C0: bilinear(A1, A2)}
+    names |= {symbol: h**2 for symbol, h in zip(SQUARES, gradient_at_measurement(), strict=True)}
+    return Let(names | {start: C0 / (sum(SQUARES) + _TINY)}), start
+
+
+def foot_point_fast(passes: int) -> tuple[tuple[Let | Loop, ...], sp.Symbol, sp.Symbol]:
+    """Return Newton's iteration for phi(l) = 0 from the Sampson correction, root and last change.
+
+    Where it leaves the interval between the poles, the change is the root itself: not found.
+    """
+    l, change, newton, last = _symbols("l", "change", "newton", "last")
+    phi, slope = secular(l)
+    begin, start = _start()
+    loop = Loop(
+        start={l: start, change: sp.Integer(0)},
+        body=reciprocals(l) | {newton: phi / (slope + _TINY)},
+        update={l: l + newton, change: newton},
+        passes=passes,
+    )
+    inside = Let({last: select(_INSIDE - sp.Abs(l) * S.entries()[0], change, l)})
+    return (rotate_match(), begin, loop, inside), l, last
+
+
+def foot_point_safe(passes: int) -> tuple[tuple[Let | Loop, ...], sp.Symbol, sp.Symbol]:
     """Return the bracketed Newton iteration for phi(l) = 0, the root and its last change."""
     l, low, high, change = _symbols("l", "low", "high", "change")
     value, step, lower, upper_, moved = _symbols("value", "step", "low_new", "high_new", "moved")
-    pole, start = _symbols("pole", "start")
+    pole = sp.Symbol("pole", real=True)
     phi, slope = secular(l)
+    begin, start = _start()
 
     def bracketed(trial: sp.Expr, lower: sp.Expr, upper: sp.Expr) -> sp.Expr:
         return select((lower - trial) * (upper - trial), (lower + upper) / 2, trial)
 
-    names = {C0: bilinear(A1, A2)}
-    names |= {symbol: h**2 for symbol, h in zip(SQUARES, gradient_at_measurement(), strict=True)}
-    names |= {pole: _INSIDE / (S.entries()[0] + sp.Float("1e-140"))}
-    names |= {start: C0 / (sum(SQUARES) + _TINY)}
+    ends = Let({pole: _INSIDE / (S.entries()[0] + sp.Float("1e-140"))})
     loop = Loop(
         start={
             l: bracketed(start, -pole, pole),
@@ -132,7 +172,7 @@ def foot_point(passes: int) -> tuple[tuple[Let | Loop, ...], sp.Symbol, sp.Symbo
         update={l: moved, low: lower, high: upper_, change: moved - l},
         passes=passes,
     )
-    return (rotate_match(), Let(names), loop), l, change
+    return (rotate_match(), begin, ends, loop), l, change
 
 
 def stationary_point() -> tuple[list[sp.Expr], list[sp.Expr], list[sp.Expr]]:
@@ -193,13 +233,17 @@ def _frame() -> Kernel:
 
 def _foot_points() -> list[Kernel]:
     made = []
-    for name, passes in (("foot_point", FAST_PASSES), ("foot_point_safe", SAFE_PASSES)):
-        stages, l, change = foot_point(passes)
+    for name, found, passes, how in (
+        ("foot_point", foot_point_fast, FAST_PASSES, "Newton"),
+        ("foot_point_more", foot_point_fast, MORE_PASSES, "Newton"),
+        ("foot_point_safe", foot_point_safe, SAFE_PASSES, "bracketed Newton"),
+    ):
+        stages, l, change = found(passes)
         norm2 = sum(h * r**2 for h, r in zip(SQUARES, RECIPROCALS, strict=True))
         made.append(
             Kernel(
                 name,
-                f"multiplier l of the foot point by {passes} passes of bracketed Newton from "
+                f"multiplier l of the foot point by {passes} passes of {how} from "
                 "the Sampson correction, its last change, and the signed distance d = l |n|.",
                 (*FRAME, Q1, Q2),
                 (
@@ -289,12 +333,12 @@ def _normal_equations() -> list[Kernel]:
     squared = sp.Symbol("length2", real=True)
     C_F = sp.Matrix(_point_derivative(z[:2], z[2:]))
     # d * dd/dF = l |n| * C_F / |n|
-    gradient = weight.symbol() * l * C_F
+    gradient = Output.of("g", weight.symbol() * l * C_F, summed=True)
     gauss_newton = weight.symbol() * C_F * C_F.T / squared
-    stages = (rotate_match(), Let(values))
-    with_length = (rotate_match(), Let(values | {squared: sum(e**2 for e in n) + _TINY}))
+    normal = Output.of("N", upper(gauss_newton), summed=True)
     hessian, _ = exact_hessian(z, n, l)
     exact = weight.symbol() * hessian + curvature.symbol() * l**2 * C_F * C_F.T
+    stages = (rotate_match(), Let(values | {squared: sum(e**2 for e in n) + _TINY}))
     arguments = (*FRAME, Q1, Q2, MULTIPLIER, weight)
     return [
         Kernel(
@@ -302,21 +346,15 @@ def _normal_equations() -> list[Kernel]:
             "gradient and Gauss-Newton matrix (upper triangle) of sum weight d^2 / 2 by vect(F) "
             "of the rotated images.",
             arguments,
-            (
-                Output.of("g", gradient, summed=True),
-                Output.of("N", upper(gauss_newton), summed=True),
-            ),
-            with_length,
+            (gradient, normal),
+            stages,
         ),
         Kernel(
             "reprojection_newton",
-            "gradient and exact Hessian (upper triangle) of a robust sum of d^2 / 2 by vect(F) of "
-            "the rotated images, from H = l C_FF - R^T K^-1 R for each match.",
+            "gradient, Gauss-Newton matrix and exact Hessian (upper triangles) of a robust sum of "
+            "d^2 / 2 by vect(F) of the rotated images, H = l C_FF - R^T K^-1 R for each match.",
             (*arguments, curvature),
-            (
-                Output.of("g", gradient, summed=True),
-                Output.of("H", upper(exact), summed=True),
-            ),
+            (gradient, normal, Output.of("H", upper(exact), summed=True)),
             stages,
         ),
     ]

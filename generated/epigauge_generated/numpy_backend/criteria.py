@@ -92,12 +92,12 @@ def epipolar(F, q1, q2, r, dr_dF):
     dr_dF[1, 8] = t8
 
 
-def epipolar_gauss_newton(F, q1, q2, weight, g, N):
-    # Formula: gradient and Gauss-Newton matrix (upper triangle) by vect(F) of the weighted sum
-    # of squared epipolar residuals, halved.
+def epipolar_gauss_newton(F, q1, q2, weight, cost, g, N):
+    # Formula: half the weighted sum of squared epipolar residuals, its gradient and Gauss-Newton
+    # matrix (upper triangle) by vect(F).
     # Inputs:  F (3, 3) shared, q1 (2,), q2 (2,), weight ()
-    # Outputs: g (9,) summed, N (45,) summed
-    # Operations: 302, temporaries: 49.
+    # Outputs: cost () summed, g (9,) summed, N (45,) summed
+    # Operations: 308, temporaries: 50.
     F00 = F[0, 0]
     F01 = F[0, 1]
     F02 = F[0, 2]
@@ -111,353 +111,443 @@ def epipolar_gauss_newton(F, q1, q2, weight, g, N):
     q1_1 = q1[1]
     q2_0 = q2[0]
     q2_1 = q2[1]
-    t3 = F02 + F00*q1_0 + F01*q1_1
-    t4 = F12 + F10*q1_0 + F11*q1_1
-    t5 = t3*t3 + t4*t4
-    t6 = 1.0/np.sqrt(t5)
-    t7 = q2_0*t6
-    t0 = F20 + F00*q2_0 + F10*q2_1
-    t1 = F21 + F01*q2_0 + F11*q2_1
-    t2 = F22 + F02*q2_0 + F12*q2_1 + q1_0*t0 + q1_1*t1
-    t8 = t2/(t5*np.sqrt(t5))
-    t9 = t3*t8
-    t10 = q1_0*t7 - q1_0*t9
-    t11 = t10*t6
-    t12 = t0*t0 + t1*t1
-    t13 = 1.0/np.sqrt(t12)
-    t14 = q1_0*t13
-    t15 = t2/(t12*np.sqrt(t12))
-    t16 = q2_0*t15
-    t17 = q2_0*t14 - t0*t16
-    t18 = t13*t17
-    t19 = q1_1*t7 - q1_1*t9
-    t20 = t19*t6
-    t21 = q1_1*t13
-    t22 = q2_0*t21 - t1*t16
-    t23 = t13*t22
-    t24 = 1.0/t12
-    t25 = t2*t24
-    t26 = t7 - t3*t8
-    t27 = t26*t6
-    t28 = q2_1*t6
-    t29 = t4*t8
-    t30 = q1_0*t28 - q1_0*t29
-    t31 = t30*t6
-    t32 = q2_1*t15
-    t33 = q2_1*t14 - t0*t32
-    t34 = t13*t33
-    t35 = q1_1*t28 - q1_1*t29
-    t36 = t35*t6
-    t37 = q2_1*t21 - t1*t32
-    t38 = t13*t37
-    t39 = t28 - t4*t8
-    t40 = t39*t6
-    t41 = 1.0/t5
-    t42 = t2*t41
-    t43 = t14 - t0*t15
-    t44 = t13*t43
-    t45 = t21 - t1*t15
-    t46 = t13*t45
-    t47 = q2_0*t24
-    t48 = q1_0*t41
-    g[0] = np.add.reduce(weight*(t11*t2 + t18*t2), axis=-1)
-    g[1] = np.add.reduce(weight*(t2*t20 + t2*t23), axis=-1)
-    g[2] = np.add.reduce(weight*(q2_0*t25 + t2*t27), axis=-1)
-    g[3] = np.add.reduce(weight*(t2*t31 + t2*t34), axis=-1)
-    g[4] = np.add.reduce(weight*(t2*t36 + t2*t38), axis=-1)
-    g[5] = np.add.reduce(weight*(q2_1*t25 + t2*t40), axis=-1)
-    g[6] = np.add.reduce(weight*(q1_0*t42 + t2*t44), axis=-1)
-    g[7] = np.add.reduce(weight*(q1_1*t42 + t2*t46), axis=-1)
-    g[8] = np.add.reduce(weight*(t25 + t42), axis=-1)
-    N[0] = np.add.reduce(weight*(t10*t10 + t17*t17), axis=-1)
-    N[1] = np.add.reduce(weight*(t10*t19 + t17*t22), axis=-1)
-    N[2] = np.add.reduce(weight*(q2_0*t18 + t10*t26), axis=-1)
-    N[3] = np.add.reduce(weight*(t10*t30 + t17*t33), axis=-1)
-    N[4] = np.add.reduce(weight*(t10*t35 + t17*t37), axis=-1)
-    N[5] = np.add.reduce(weight*(q2_1*t18 + t10*t39), axis=-1)
-    N[6] = np.add.reduce(weight*(q1_0*t11 + t17*t43), axis=-1)
-    N[7] = np.add.reduce(weight*(q1_1*t11 + t17*t45), axis=-1)
-    N[8] = np.add.reduce(weight*(t11 + t18), axis=-1)
-    N[9] = np.add.reduce(weight*(t19*t19 + t22*t22), axis=-1)
-    N[10] = np.add.reduce(weight*(q2_0*t23 + t19*t26), axis=-1)
-    N[11] = np.add.reduce(weight*(t19*t30 + t22*t33), axis=-1)
-    N[12] = np.add.reduce(weight*(t19*t35 + t22*t37), axis=-1)
-    N[13] = np.add.reduce(weight*(q2_1*t23 + t19*t39), axis=-1)
-    N[14] = np.add.reduce(weight*(q1_0*t20 + t22*t43), axis=-1)
-    N[15] = np.add.reduce(weight*(q1_1*t20 + t22*t45), axis=-1)
-    N[16] = np.add.reduce(weight*(t20 + t23), axis=-1)
-    N[17] = np.add.reduce(weight*(t26*t26 + q2_0*q2_0*t24), axis=-1)
-    N[18] = np.add.reduce(weight*(q2_0*t34 + t26*t30), axis=-1)
-    N[19] = np.add.reduce(weight*(q2_0*t38 + t26*t35), axis=-1)
-    N[20] = np.add.reduce(weight*(q2_1*t47 + t26*t39), axis=-1)
-    N[21] = np.add.reduce(weight*(q1_0*t27 + q2_0*t44), axis=-1)
-    N[22] = np.add.reduce(weight*(q1_1*t27 + q2_0*t46), axis=-1)
-    N[23] = np.add.reduce(weight*(t27 + t47), axis=-1)
-    N[24] = np.add.reduce(weight*(t30*t30 + t33*t33), axis=-1)
-    N[25] = np.add.reduce(weight*(t30*t35 + t33*t37), axis=-1)
-    N[26] = np.add.reduce(weight*(q2_1*t34 + t30*t39), axis=-1)
-    N[27] = np.add.reduce(weight*(q1_0*t31 + t33*t43), axis=-1)
-    N[28] = np.add.reduce(weight*(q1_1*t31 + t33*t45), axis=-1)
-    N[29] = np.add.reduce(weight*(t31 + t34), axis=-1)
-    N[30] = np.add.reduce(weight*(t35*t35 + t37*t37), axis=-1)
-    N[31] = np.add.reduce(weight*(q2_1*t38 + t35*t39), axis=-1)
-    N[32] = np.add.reduce(weight*(q1_0*t36 + t37*t43), axis=-1)
-    N[33] = np.add.reduce(weight*(q1_1*t36 + t37*t45), axis=-1)
-    N[34] = np.add.reduce(weight*(t36 + t38), axis=-1)
-    N[35] = np.add.reduce(weight*(t39*t39 + q2_1*q2_1*t24), axis=-1)
-    N[36] = np.add.reduce(weight*(q1_0*t40 + q2_1*t44), axis=-1)
-    N[37] = np.add.reduce(weight*(q1_1*t40 + q2_1*t46), axis=-1)
-    N[38] = np.add.reduce(weight*(t40 + q2_1*t24), axis=-1)
-    N[39] = np.add.reduce(weight*(t43*t43 + q1_0*q1_0*t41), axis=-1)
-    N[40] = np.add.reduce(weight*(q1_1*t48 + t43*t45), axis=-1)
-    N[41] = np.add.reduce(weight*(t44 + t48), axis=-1)
-    N[42] = np.add.reduce(weight*(t45*t45 + q1_1*q1_1*t41), axis=-1)
-    N[43] = np.add.reduce(weight*(t46 + q1_1*t41), axis=-1)
-    N[44] = np.add.reduce(weight*(t24 + t41), axis=-1)
-
-
-def epipolar_newton(F, q1, q2, weight, curvature, g, H):
-    # Formula: gradient and exact Hessian (upper triangle) by vect(F) of a robust sum of squared
-    # epipolar residuals, halved.
-    # Inputs:  F (3, 3) shared, q1 (2,), q2 (2,), weight (), curvature ()
-    # Outputs: g (9,) summed, H (45,) summed
-    # Operations: 958, temporaries: 169.
-    F00 = F[0, 0]
-    F01 = F[0, 1]
-    F02 = F[0, 2]
-    F10 = F[1, 0]
-    F11 = F[1, 1]
-    F12 = F[1, 2]
-    F20 = F[2, 0]
-    F21 = F[2, 1]
-    F22 = F[2, 2]
-    q1_0 = q1[0]
-    q1_1 = q1[1]
-    q2_0 = q2[0]
-    q2_1 = q2[1]
-    t10 = F01*q1_1
-    t9 = F00*q1_0
-    t11 = F02 + t10 + t9
-    t12 = t11*t11
-    t13 = F10*q1_0
-    t14 = F11*q1_1
-    t15 = F12 + t13 + t14
-    t16 = t15*t15
-    t17 = t12 + t16
-    t18 = 1.0/np.sqrt(t17)
+    t0 = F02 + F00*q1_0 + F01*q1_1
+    t1 = F12 + F10*q1_0 + F11*q1_1
+    t2 = t0*t0 + t1*t1
+    t3 = 1.0/t2
+    t4 = F20 + F00*q2_0 + F10*q2_1
+    t5 = F21 + F01*q2_0 + F11*q2_1
+    t6 = F22 + F02*q2_0 + F12*q2_1 + q1_0*t4 + q1_1*t5
+    t7 = t6*t6
+    t8 = t4*t4 + t5*t5
+    t9 = 1.0/t8
+    t10 = 1.0/np.sqrt(t2)
+    t11 = q2_0*t10
+    t12 = t6/(t2*np.sqrt(t2))
+    t13 = t0*t12
+    t14 = q1_0*t11 - q1_0*t13
+    t15 = t10*t14
+    t16 = 1.0/np.sqrt(t8)
+    t17 = q1_0*t16
+    t18 = t6/(t8*np.sqrt(t8))
     t19 = q2_0*t18
-    t20 = 1.0/(t17*np.sqrt(t17))
-    t0 = F00*q2_0
-    t1 = F10*q2_1
-    t2 = F20 + t0 + t1
-    t3 = q1_0*t2
-    t4 = F01*q2_0
-    t5 = F11*q2_1
-    t6 = F21 + t4 + t5
-    t7 = q1_1*t6
-    t8 = F22 + t3 + t7 + F02*q2_0 + F12*q2_1
-    t21 = t20*t8
-    t22 = q1_0*t21
-    t23 = q1_0*t19 - t11*t22
-    t24 = t18*t23
-    t25 = t2*t2
-    t26 = t6*t6
-    t27 = t25 + t26
-    t28 = 1.0/np.sqrt(t27)
-    t29 = q1_0*t28
-    t30 = 1.0/(t27*np.sqrt(t27))
-    t31 = t30*t8
-    t32 = q2_0*t31
-    t33 = q2_0*t29 - t2*t32
-    t34 = t28*t33
-    t35 = t24*t8 + t34*t8
-    t36 = q1_1*t21
-    t37 = q1_1*t19 - t11*t36
-    t38 = t18*t37
-    t39 = q1_1*t28
-    t40 = q2_0*t39 - t32*t6
-    t41 = t28*t40
-    t42 = t38*t8 + t41*t8
-    t43 = 1.0/t27
-    t44 = t43*t8
-    t45 = -t11
-    t46 = t19 + t21*t45
-    t47 = t18*t46
-    t48 = q2_0*t44 + t47*t8
-    t49 = q2_1*t18
-    t50 = q1_0*t49 - t15*t22
-    t51 = t18*t50
-    t52 = q2_1*t31
-    t53 = q2_1*t29 - t2*t52
-    t54 = t28*t53
-    t55 = t51*t8 + t54*t8
-    t56 = q1_1*t49 - t15*t36
-    t57 = t18*t56
-    t58 = q2_1*t39 - t52*t6
-    t59 = t28*t58
-    t60 = t57*t8 + t59*t8
-    t61 = -t15
-    t62 = t49 + t21*t61
-    t63 = t18*t62
-    t64 = q2_1*t44 + t63*t8
-    t65 = 1.0/t17
-    t66 = t65*t8
-    t67 = -t2
-    t68 = t29 + t31*t67
-    t69 = t28*t68
-    t70 = q1_0*t66 + t69*t8
-    t71 = -t6
-    t72 = t39 + t31*t71
-    t73 = t28*t72
-    t74 = q1_1*t66 + t73*t8
-    t75 = t44 + t66
-    t76 = q1_0*q1_0
-    t77 = q2_0*t20
-    t78 = 2.0*t77
-    t79 = t11*t78
-    t80 = t21*t76
-    t81 = 1.0/(t17*t17*np.sqrt(t17))
-    t82 = t18*t8
-    t83 = q2_0*q2_0
-    t84 = 2.0*t30
-    t85 = t83*t84
-    t86 = t31*t83
-    t87 = 1.0/(t27*t27*np.sqrt(t27))
-    t88 = t28*t8
-    t89 = curvature*t35
-    t90 = q1_0*t30
-    t91 = t6*t83
-    t92 = q1_1*t30
-    t93 = t2*t83
-    t94 = q1_0*t77
-    t95 = t11*t94
-    t96 = 2.0*q1_1
-    t97 = q1_1*t22
-    t100 = -3.0*F02 - 3.0*t10 - 3.0*t9
-    t101 = t8*t81
-    t102 = t100*t101
-    t98 = t8/(t27*t27)
-    t99 = q1_0*t11
-    t103 = t15*t77
-    t104 = q2_1*t20
-    t105 = t104*t11
-    t106 = q2_0*t30
-    t107 = t106*t3
-    t108 = 2.0*q2_1
-    t109 = q2_1*t32
-    t110 = t15*t94
-    t111 = q1_0*t105
-    t112 = q2_0*t6*t90
-    t113 = q2_0*t2
-    t114 = t113*t92
-    t115 = t82*(3.0*q1_0*q1_1*t11*t15*t8*t81 - q1_1*t110 - q1_1*t111) + t88*(3.0*q2_0*q2_1*t2*t6*t8*t87 - q2_1*t112 - q2_1*t114)
-    t116 = t113*t98
-    t117 = -q2_1*t116
-    t118 = -3.0*F12 - 3.0*t13 - 3.0*t14
-    t119 = t101*t118
-    t120 = t8/(t17*t17)
-    t121 = t11*t120
-    t122 = -3.0*F20 - 3.0*t0 - 3.0*t1
-    t123 = t8*t87
-    t124 = t122*t123
-    t125 = q1_0*t121
-    t126 = -q1_1*t125
-    t127 = -3.0*F21 - 3.0*t4 - 3.0*t5
-    t128 = t123*t127
-    t129 = q1_1*q1_1
-    t130 = t129*t21
-    t131 = curvature*t42
-    t132 = q1_1*t11
-    t133 = t106*t7
-    t134 = t6*t98
-    t135 = q2_0*t134
-    t136 = -q2_1*t135
-    t137 = q2_0*t6
-    t138 = -t21
-    t139 = t101*t45
-    t140 = curvature*t48
-    t141 = 3.0*t139*t15
-    t142 = q2_0*t43
-    t143 = t120*t45
-    t144 = t67*t98
-    t145 = t71*t98
-    t146 = 2.0*t104
-    t147 = t146*t15
-    t148 = q2_1*q2_1
-    t149 = t148*t84
-    t150 = t148*t31
-    t151 = curvature*t55
-    t152 = t6*t90
-    t153 = t148*t2
-    t154 = q1_0*t104*t15
-    t155 = t119*t15
-    t156 = t120*t15
-    t157 = q2_1*t30
-    t158 = q2_1*t2
-    t159 = q1_0*t156
-    t160 = -q1_1*t159
-    t161 = curvature*t60
-    t162 = q2_1*t6
-    t163 = t120*t61
-    t164 = curvature*t64
-    t165 = -t31
-    t166 = t123*t67
-    t167 = curvature*t70
-    t168 = q1_0*t65
-    g[0] = np.add.reduce(t35*weight, axis=-1)
-    g[1] = np.add.reduce(t42*weight, axis=-1)
-    g[2] = np.add.reduce(t48*weight, axis=-1)
-    g[3] = np.add.reduce(t55*weight, axis=-1)
-    g[4] = np.add.reduce(t60*weight, axis=-1)
-    g[5] = np.add.reduce(t64*weight, axis=-1)
-    g[6] = np.add.reduce(t70*weight, axis=-1)
-    g[7] = np.add.reduce(t74*weight, axis=-1)
-    g[8] = np.add.reduce(t75*weight, axis=-1)
-    H[0] = np.add.reduce(curvature*t35*t35 + weight*(t23*t23 + t33*t33 + t82*(3.0*t12*t76*t8*t81 - t80 - t76*t79) + t88*(3.0*t25*t8*t83*t87 - t86 - t3*t85)), axis=-1)
-    H[1] = np.add.reduce(t42*t89 + weight*(t23*t37 + t33*t40 + t82*(3.0*q1_0*q1_1*t12*t8*t81 - t97 - t95*t96) + t88*(3.0*t2*t6*t8*t83*t87 - t90*t91 - t92*t93)), axis=-1)
-    H[2] = np.add.reduce(t48*t89 + weight*(q2_0*t34 + t23*t46 + t82*(q1_0*q2_0*t20*t45 - t22 - t95 - t102*t99) - t93*t98), axis=-1)
-    H[3] = np.add.reduce(t55*t89 + weight*(t23*t50 + t33*t53 + t82*(3.0*t11*t15*t76*t8*t81 - t103*t76 - t105*t76) + t88*(3.0*q2_0*q2_1*t25*t8*t87 - t109 - t107*t108)), axis=-1)
-    H[4] = np.add.reduce(t60*t89 + weight*(t115 + t23*t56 + t33*t58), axis=-1)
-    H[5] = np.add.reduce(t64*t89 + weight*(t117 + q2_1*t34 + t23*t62 + t82*(q1_0*q2_0*t20*t61 - t111 - t119*t99)), axis=-1)
-    H[6] = np.add.reduce(t70*t89 + weight*(q1_0*t24 + t33*t68 + t88*(q1_0*q2_0*t30*t67 - t107 - t32 - t113*t124) - t121*t76), axis=-1)
-    H[7] = np.add.reduce(t74*t89 + weight*(t126 + q1_1*t24 + t33*t72 + t88*(q1_0*q2_0*t30*t71 - t114 - t113*t128)), axis=-1)
-    H[8] = np.add.reduce(t75*t89 + weight*(t18*t23 + t28*t33 - t116 - t125), axis=-1)
-    H[9] = np.add.reduce(curvature*t42*t42 + weight*(t37*t37 + t40*t40 + t82*(3.0*t12*t129*t8*t81 - t130 - t129*t79) + t88*(3.0*t26*t8*t83*t87 - t86 - t7*t85)), axis=-1)
-    H[10] = np.add.reduce(t131*t48 + weight*(q2_0*t41 + t37*t46 + t82*(q1_1*q2_0*t20*t45 - t36 - t102*t132 - q1_1*t11*t77) - t91*t98), axis=-1)
-    H[11] = np.add.reduce(t131*t55 + weight*(t115 + t37*t50 + t40*t53), axis=-1)
-    H[12] = np.add.reduce(t131*t60 + weight*(t37*t56 + t40*t58 + t82*(3.0*t11*t129*t15*t8*t81 - t103*t129 - t105*t129) + t88*(3.0*q2_0*q2_1*t26*t8*t87 - t109 - t108*t133)), axis=-1)
-    H[13] = np.add.reduce(t131*t64 + weight*(t136 + q2_1*t41 + t37*t62 + t82*(q1_1*q2_0*t20*t61 - q1_1*t105 - t119*t132)), axis=-1)
-    H[14] = np.add.reduce(t131*t70 + weight*(t126 + q1_0*t38 + t40*t68 + t88*(q1_1*q2_0*t30*t67 - t112 - t124*t137)), axis=-1)
-    H[15] = np.add.reduce(t131*t74 + weight*(q1_1*t38 + t40*t72 + t88*(q1_1*q2_0*t30*t71 - t133 - t32 - t128*t137) - t121*t129), axis=-1)
-    H[16] = np.add.reduce(t131*t75 + weight*(t18*t37 + t28*t40 - t135 - q1_1*t121), axis=-1)
-    H[17] = np.add.reduce(curvature*t48*t48 + weight*(t46*t46 + t43*t83 + t82*(t138 + t100*t139 + t45*t78)), axis=-1)
-    H[18] = np.add.reduce(t140*t55 + weight*(t117 + q2_0*t54 + t46*t50 + t82*(q1_0*q2_1*t20*t45 - t110 - q1_0*t141)), axis=-1)
-    H[19] = np.add.reduce(t140*t60 + weight*(t136 + q2_0*t59 + t46*t56 + t82*(q1_1*q2_1*t20*t45 - q1_1*t103 - q1_1*t141)), axis=-1)
-    H[20] = np.add.reduce(t140*t64 + weight*(q2_1*t142 + t46*t62 + t82*(t104*t45 + t118*t139 + t61*t77)), axis=-1)
-    H[21] = np.add.reduce(t140*t70 + weight*(q1_0*t143 + q1_0*t47 + q2_0*t144 + q2_0*t69), axis=-1)
-    H[22] = np.add.reduce(t140*t74 + weight*(q1_1*t143 + q1_1*t47 + q2_0*t145 + q2_0*t73), axis=-1)
-    H[23] = np.add.reduce(t140*t75 + weight*(t142 + t143 + t47), axis=-1)
-    H[24] = np.add.reduce(curvature*t55*t55 + weight*(t50*t50 + t53*t53 + t82*(3.0*t16*t76*t8*t81 - t80 - t147*t76) + t88*(3.0*t148*t25*t8*t87 - t150 - t149*t3)), axis=-1)
-    H[25] = np.add.reduce(t151*t60 + weight*(t50*t56 + t53*t58 + t82*(3.0*q1_0*q1_1*t16*t8*t81 - t97 - t154*t96) + t88*(3.0*t148*t2*t6*t8*t87 - t148*t152 - t153*t92)), axis=-1)
-    H[26] = np.add.reduce(t151*t64 + weight*(q2_1*t54 + t50*t62 + t82*(q1_0*q2_1*t20*t61 - t154 - t22 - q1_0*t155) - t153*t98), axis=-1)
-    H[27] = np.add.reduce(t151*t70 + weight*(q1_0*t51 + t53*t68 + t88*(q1_0*q2_1*t30*t67 - t52 - t124*t158 - t157*t3) - t156*t76), axis=-1)
-    H[28] = np.add.reduce(t151*t74 + weight*(t160 + q1_1*t51 + t53*t72 + t88*(q1_0*q2_1*t30*t71 - t128*t158 - t158*t92)), axis=-1)
-    H[29] = np.add.reduce(t151*t75 + weight*(t18*t50 + t28*t53 - t159 - t158*t98), axis=-1)
-    H[30] = np.add.reduce(curvature*t60*t60 + weight*(t56*t56 + t58*t58 + t82*(3.0*t129*t16*t8*t81 - t130 - t129*t147) + t88*(3.0*t148*t26*t8*t87 - t150 - t149*t7)), axis=-1)
-    H[31] = np.add.reduce(t161*t64 + weight*(q2_1*t59 + t56*t62 + t82*(q1_1*q2_1*t20*t61 - t36 - q1_1*t155 - q1_1*t104*t15) - t134*t148), axis=-1)
-    H[32] = np.add.reduce(t161*t70 + weight*(t160 + q1_0*t57 + t58*t68 + t88*(q1_1*q2_1*t30*t67 - q2_1*t152 - t124*t162)), axis=-1)
-    H[33] = np.add.reduce(t161*t74 + weight*(q1_1*t57 + t58*t72 + t88*(q1_1*q2_1*t30*t71 - t52 - t128*t162 - t157*t7) - t129*t156), axis=-1)
-    H[34] = np.add.reduce(t161*t75 + weight*(t18*t56 + t28*t58 - q1_1*t156 - q2_1*t134), axis=-1)
-    H[35] = np.add.reduce(curvature*t64*t64 + weight*(t62*t62 + t148*t43 + t82*(t138 + t119*t61 + t146*t61)), axis=-1)
-    H[36] = np.add.reduce(t164*t70 + weight*(q1_0*t163 + q1_0*t63 + q2_1*t144 + q2_1*t69), axis=-1)
-    H[37] = np.add.reduce(t164*t74 + weight*(q1_1*t163 + q1_1*t63 + q2_1*t145 + q2_1*t73), axis=-1)
-    H[38] = np.add.reduce(t164*t75 + weight*(t163 + t63 + q2_1*t43), axis=-1)
-    H[39] = np.add.reduce(curvature*t70*t70 + weight*(t68*t68 + t65*t76 + t88*(t165 + t122*t166 + 2.0*t67*t90)), axis=-1)
-    H[40] = np.add.reduce(t167*t74 + weight*(q1_1*t168 + t68*t72 + t88*(t127*t166 + t67*t92 + t71*t90)), axis=-1)
-    H[41] = np.add.reduce(t167*t75 + weight*(t144 + t168 + t69), axis=-1)
-    H[42] = np.add.reduce(curvature*t74*t74 + weight*(t72*t72 + t129*t65 + t88*(t165 + t128*t71 + 2.0*t71*t92)), axis=-1)
-    H[43] = np.add.reduce(weight*(t145 + t73 + q1_1*t65) + curvature*t74*t75, axis=-1)
-    H[44] = np.add.reduce(curvature*t75*t75 + weight*(t43 + t65), axis=-1)
+    t20 = q2_0*t17 - t19*t4
+    t21 = t16*t20
+    t22 = q1_1*t11 - q1_1*t13
+    t23 = t10*t22
+    t24 = q1_1*t16
+    t25 = q2_0*t24 - t19*t5
+    t26 = t16*t25
+    t27 = t6*t9
+    t28 = t11 - t0*t12
+    t29 = t10*t28
+    t30 = q2_1*t10
+    t31 = t1*t12
+    t32 = q1_0*t30 - q1_0*t31
+    t33 = t10*t32
+    t34 = q2_1*t18
+    t35 = q2_1*t17 - t34*t4
+    t36 = t16*t35
+    t37 = q1_1*t30 - q1_1*t31
+    t38 = t10*t37
+    t39 = q2_1*t24 - t34*t5
+    t40 = t16*t39
+    t41 = t30 - t1*t12
+    t42 = t10*t41
+    t43 = t3*t6
+    t44 = t17 - t18*t4
+    t45 = t16*t44
+    t46 = t24 - t18*t5
+    t47 = t16*t46
+    t48 = q2_0*t9
+    t49 = q1_0*t3
+    cost[...] = np.add.reduce(0.5*weight*(t3*t7 + t7*t9), axis=-1)
+    g[0] = np.add.reduce(weight*(t15*t6 + t21*t6), axis=-1)
+    g[1] = np.add.reduce(weight*(t23*t6 + t26*t6), axis=-1)
+    g[2] = np.add.reduce(weight*(q2_0*t27 + t29*t6), axis=-1)
+    g[3] = np.add.reduce(weight*(t33*t6 + t36*t6), axis=-1)
+    g[4] = np.add.reduce(weight*(t38*t6 + t40*t6), axis=-1)
+    g[5] = np.add.reduce(weight*(q2_1*t27 + t42*t6), axis=-1)
+    g[6] = np.add.reduce(weight*(q1_0*t43 + t45*t6), axis=-1)
+    g[7] = np.add.reduce(weight*(q1_1*t43 + t47*t6), axis=-1)
+    g[8] = np.add.reduce(weight*(t27 + t43), axis=-1)
+    N[0] = np.add.reduce(weight*(t14*t14 + t20*t20), axis=-1)
+    N[1] = np.add.reduce(weight*(t14*t22 + t20*t25), axis=-1)
+    N[2] = np.add.reduce(weight*(q2_0*t21 + t14*t28), axis=-1)
+    N[3] = np.add.reduce(weight*(t14*t32 + t20*t35), axis=-1)
+    N[4] = np.add.reduce(weight*(t14*t37 + t20*t39), axis=-1)
+    N[5] = np.add.reduce(weight*(q2_1*t21 + t14*t41), axis=-1)
+    N[6] = np.add.reduce(weight*(q1_0*t15 + t20*t44), axis=-1)
+    N[7] = np.add.reduce(weight*(q1_1*t15 + t20*t46), axis=-1)
+    N[8] = np.add.reduce(weight*(t15 + t21), axis=-1)
+    N[9] = np.add.reduce(weight*(t22*t22 + t25*t25), axis=-1)
+    N[10] = np.add.reduce(weight*(q2_0*t26 + t22*t28), axis=-1)
+    N[11] = np.add.reduce(weight*(t22*t32 + t25*t35), axis=-1)
+    N[12] = np.add.reduce(weight*(t22*t37 + t25*t39), axis=-1)
+    N[13] = np.add.reduce(weight*(q2_1*t26 + t22*t41), axis=-1)
+    N[14] = np.add.reduce(weight*(q1_0*t23 + t25*t44), axis=-1)
+    N[15] = np.add.reduce(weight*(q1_1*t23 + t25*t46), axis=-1)
+    N[16] = np.add.reduce(weight*(t23 + t26), axis=-1)
+    N[17] = np.add.reduce(weight*(t28*t28 + q2_0*q2_0*t9), axis=-1)
+    N[18] = np.add.reduce(weight*(q2_0*t36 + t28*t32), axis=-1)
+    N[19] = np.add.reduce(weight*(q2_0*t40 + t28*t37), axis=-1)
+    N[20] = np.add.reduce(weight*(q2_1*t48 + t28*t41), axis=-1)
+    N[21] = np.add.reduce(weight*(q1_0*t29 + q2_0*t45), axis=-1)
+    N[22] = np.add.reduce(weight*(q1_1*t29 + q2_0*t47), axis=-1)
+    N[23] = np.add.reduce(weight*(t29 + t48), axis=-1)
+    N[24] = np.add.reduce(weight*(t32*t32 + t35*t35), axis=-1)
+    N[25] = np.add.reduce(weight*(t32*t37 + t35*t39), axis=-1)
+    N[26] = np.add.reduce(weight*(q2_1*t36 + t32*t41), axis=-1)
+    N[27] = np.add.reduce(weight*(q1_0*t33 + t35*t44), axis=-1)
+    N[28] = np.add.reduce(weight*(q1_1*t33 + t35*t46), axis=-1)
+    N[29] = np.add.reduce(weight*(t33 + t36), axis=-1)
+    N[30] = np.add.reduce(weight*(t37*t37 + t39*t39), axis=-1)
+    N[31] = np.add.reduce(weight*(q2_1*t40 + t37*t41), axis=-1)
+    N[32] = np.add.reduce(weight*(q1_0*t38 + t39*t44), axis=-1)
+    N[33] = np.add.reduce(weight*(q1_1*t38 + t39*t46), axis=-1)
+    N[34] = np.add.reduce(weight*(t38 + t40), axis=-1)
+    N[35] = np.add.reduce(weight*(t41*t41 + q2_1*q2_1*t9), axis=-1)
+    N[36] = np.add.reduce(weight*(q1_0*t42 + q2_1*t45), axis=-1)
+    N[37] = np.add.reduce(weight*(q1_1*t42 + q2_1*t47), axis=-1)
+    N[38] = np.add.reduce(weight*(t42 + q2_1*t9), axis=-1)
+    N[39] = np.add.reduce(weight*(t44*t44 + q1_0*q1_0*t3), axis=-1)
+    N[40] = np.add.reduce(weight*(q1_1*t49 + t44*t46), axis=-1)
+    N[41] = np.add.reduce(weight*(t45 + t49), axis=-1)
+    N[42] = np.add.reduce(weight*(t46*t46 + q1_1*q1_1*t3), axis=-1)
+    N[43] = np.add.reduce(weight*(t47 + q1_1*t3), axis=-1)
+    N[44] = np.add.reduce(weight*(t3 + t9), axis=-1)
+
+
+def epipolar_newton(F, q1, q2, weight, curvature, cost, g, N, H):
+    # Formula: half the weighted sum of squared epipolar residuals, and by vect(F) the gradient,
+    # the Gauss-Newton matrix and exact Hessian (upper triangles) of their robust sum, halved.
+    # Inputs:  F (3, 3) shared, q1 (2,), q2 (2,), weight (), curvature ()
+    # Outputs: cost () summed, g (9,) summed, N (45,) summed, H (45,) summed
+    # Operations: 1012, temporaries: 211.
+    F00 = F[0, 0]
+    F01 = F[0, 1]
+    F02 = F[0, 2]
+    F10 = F[1, 0]
+    F11 = F[1, 1]
+    F12 = F[1, 2]
+    F20 = F[2, 0]
+    F21 = F[2, 1]
+    F22 = F[2, 2]
+    q1_0 = q1[0]
+    q1_1 = q1[1]
+    q2_0 = q2[0]
+    q2_1 = q2[1]
+    t10 = F00*q2_0
+    t11 = F10*q2_1
+    t12 = F20 + t10 + t11
+    t13 = q1_0*t12
+    t14 = F01*q2_0
+    t15 = F11*q2_1
+    t16 = F21 + t14 + t15
+    t17 = q1_1*t16
+    t18 = F22 + t13 + t17 + F02*q2_0 + F12*q2_1
+    t19 = t18*t18
+    t20 = t12*t12
+    t21 = t16*t16
+    t22 = t20 + t21
+    t23 = 1.0/t22
+    t0 = F00*q1_0
+    t1 = F01*q1_1
+    t2 = F02 + t0 + t1
+    t3 = t2*t2
+    t4 = F10*q1_0
+    t5 = F11*q1_1
+    t6 = F12 + t4 + t5
+    t7 = t6*t6
+    t8 = t3 + t7
+    t9 = 1.0/t8
+    t24 = 1.0/np.sqrt(t8)
+    t25 = q2_0*t24
+    t26 = 1.0/(t8*np.sqrt(t8))
+    t27 = t18*t26
+    t28 = q1_0*t27
+    t29 = q1_0*t25 - t2*t28
+    t30 = t24*t29
+    t31 = 1.0/np.sqrt(t22)
+    t32 = q1_0*t31
+    t33 = 1.0/(t22*np.sqrt(t22))
+    t34 = t18*t33
+    t35 = q2_0*t34
+    t36 = q2_0*t32 - t12*t35
+    t37 = t31*t36
+    t38 = t18*t30 + t18*t37
+    t39 = q1_1*t27
+    t40 = q1_1*t25 - t2*t39
+    t41 = t24*t40
+    t42 = q1_1*t31
+    t43 = q2_0*t42 - t16*t35
+    t44 = t31*t43
+    t45 = t18*t41 + t18*t44
+    t46 = t18*t23
+    t47 = -t2
+    t48 = t25 + t27*t47
+    t49 = t24*t48
+    t50 = q2_0*t46 + t18*t49
+    t51 = q2_1*t24
+    t52 = q1_0*t51 - t28*t6
+    t53 = t24*t52
+    t54 = q2_1*t34
+    t55 = q2_1*t32 - t12*t54
+    t56 = t31*t55
+    t57 = t18*t53 + t18*t56
+    t58 = q1_1*t51 - t39*t6
+    t59 = t24*t58
+    t60 = q2_1*t42 - t16*t54
+    t61 = t31*t60
+    t62 = t18*t59 + t18*t61
+    t63 = -t6
+    t64 = t51 + t27*t63
+    t65 = t24*t64
+    t66 = q2_1*t46 + t18*t65
+    t67 = t18*t9
+    t68 = -t12
+    t69 = t32 + t34*t68
+    t70 = t31*t69
+    t71 = q1_0*t67 + t18*t70
+    t72 = -t16
+    t73 = t42 + t34*t72
+    t74 = t31*t73
+    t75 = q1_1*t67 + t18*t74
+    t76 = t46 + t67
+    t77 = t29*t29 + t36*t36
+    t78 = t29*t40 + t36*t43
+    t79 = q2_0*t37 + t29*t48
+    t80 = t29*t52 + t36*t55
+    t81 = t29*t58 + t36*t60
+    t82 = q2_1*t37 + t29*t64
+    t83 = q1_0*t30 + t36*t69
+    t84 = q1_1*t30 + t36*t73
+    t85 = t40*t40 + t43*t43
+    t86 = q2_0*t44 + t40*t48
+    t87 = t40*t52 + t43*t55
+    t88 = t40*t58 + t43*t60
+    t89 = q2_1*t44 + t40*t64
+    t90 = q1_0*t41 + t43*t69
+    t91 = q1_1*t41 + t43*t73
+    t92 = q2_0*q2_0
+    t93 = t48*t48 + t23*t92
+    t94 = q2_0*t56 + t48*t52
+    t95 = q2_0*t61 + t48*t58
+    t96 = q2_0*t23
+    t97 = q2_1*t96 + t48*t64
+    t98 = q1_0*t49 + q2_0*t70
+    t99 = q1_1*t49 + q2_0*t74
+    t100 = t49 + t96
+    t101 = t52*t52 + t55*t55
+    t102 = t52*t58 + t55*t60
+    t103 = q2_1*t56 + t52*t64
+    t104 = q1_0*t53 + t55*t69
+    t105 = q1_1*t53 + t55*t73
+    t106 = t58*t58 + t60*t60
+    t107 = q2_1*t61 + t58*t64
+    t108 = q1_0*t59 + t60*t69
+    t109 = q1_1*t59 + t60*t73
+    t110 = q2_1*q2_1
+    t111 = t64*t64 + t110*t23
+    t112 = q1_0*t65 + q2_1*t70
+    t113 = q1_1*t65 + q2_1*t74
+    t114 = t65 + q2_1*t23
+    t115 = q1_0*q1_0
+    t116 = t69*t69 + t115*t9
+    t117 = q1_0*t9
+    t118 = q1_1*t117 + t69*t73
+    t119 = t117 + t70
+    t120 = q1_1*q1_1
+    t121 = t73*t73 + t120*t9
+    t122 = t74 + q1_1*t9
+    t123 = weight*(t23 + t9)
+    t124 = q2_0*t26
+    t125 = 2.0*t124
+    t126 = t125*t2
+    t127 = t115*t27
+    t128 = 1.0/(t8*t8*np.sqrt(t8))
+    t129 = t18*t24
+    t130 = 2.0*t33
+    t131 = t130*t92
+    t132 = t34*t92
+    t133 = 1.0/(t22*t22*np.sqrt(t22))
+    t134 = t18*t31
+    t135 = curvature*t38
+    t136 = q1_0*t124
+    t137 = t136*t2
+    t138 = 2.0*q1_1
+    t139 = q1_1*t28
+    t140 = q1_0*t33
+    t141 = t16*t92
+    t142 = q1_1*t33
+    t143 = t12*t92
+    t144 = q1_0*t2
+    t145 = -3.0*F02 - 3.0*t0 - 3.0*t1
+    t146 = t128*t18
+    t147 = t145*t146
+    t148 = t18/(t22*t22)
+    t149 = t124*t6
+    t150 = q2_1*t26
+    t151 = t150*t2
+    t152 = q2_0*t33
+    t153 = t13*t152
+    t154 = 2.0*q2_1
+    t155 = q2_1*t35
+    t156 = t136*t6
+    t157 = q1_0*t151
+    t158 = q2_0*t140*t16
+    t159 = q2_0*t12
+    t160 = t142*t159
+    t161 = t129*(3.0*q1_0*q1_1*t128*t18*t2*t6 - q1_1*t156 - q1_1*t157) + t134*(3.0*q2_0*q2_1*t12*t133*t16*t18 - q2_1*t158 - q2_1*t160)
+    t162 = -3.0*F12 - 3.0*t4 - 3.0*t5
+    t163 = t146*t162
+    t164 = t148*t159
+    t165 = -q2_1*t164
+    t166 = -3.0*F20 - 3.0*t10 - 3.0*t11
+    t167 = t133*t18
+    t168 = t166*t167
+    t169 = t18/(t8*t8)
+    t170 = t169*t2
+    t171 = -3.0*F21 - 3.0*t14 - 3.0*t15
+    t172 = t167*t171
+    t173 = q1_0*t170
+    t174 = -q1_1*t173
+    t175 = t120*t27
+    t176 = curvature*t45
+    t177 = q1_1*t2
+    t178 = t152*t17
+    t179 = t148*t16
+    t180 = q2_0*t179
+    t181 = -q2_1*t180
+    t182 = q2_0*t16
+    t183 = -t27
+    t184 = t146*t47
+    t185 = curvature*t50
+    t186 = 3.0*t184*t6
+    t187 = t169*t47
+    t188 = t148*t68
+    t189 = t148*t72
+    t190 = 2.0*t150
+    t191 = t190*t6
+    t192 = t110*t130
+    t193 = t110*t34
+    t194 = curvature*t57
+    t195 = q1_0*t150*t6
+    t196 = t140*t16
+    t197 = t110*t12
+    t198 = t163*t6
+    t199 = q2_1*t33
+    t200 = q2_1*t12
+    t201 = t169*t6
+    t202 = q1_0*t201
+    t203 = -q1_1*t202
+    t204 = curvature*t62
+    t205 = q2_1*t16
+    t206 = t169*t63
+    t207 = curvature*t66
+    t208 = -t34
+    t209 = t167*t68
+    t210 = curvature*t71
+    cost[...] = np.add.reduce(0.5*weight*(t19*t23 + t19*t9), axis=-1)
+    g[0] = np.add.reduce(t38*weight, axis=-1)
+    g[1] = np.add.reduce(t45*weight, axis=-1)
+    g[2] = np.add.reduce(t50*weight, axis=-1)
+    g[3] = np.add.reduce(t57*weight, axis=-1)
+    g[4] = np.add.reduce(t62*weight, axis=-1)
+    g[5] = np.add.reduce(t66*weight, axis=-1)
+    g[6] = np.add.reduce(t71*weight, axis=-1)
+    g[7] = np.add.reduce(t75*weight, axis=-1)
+    g[8] = np.add.reduce(t76*weight, axis=-1)
+    N[0] = np.add.reduce(t77*weight, axis=-1)
+    N[1] = np.add.reduce(t78*weight, axis=-1)
+    N[2] = np.add.reduce(t79*weight, axis=-1)
+    N[3] = np.add.reduce(t80*weight, axis=-1)
+    N[4] = np.add.reduce(t81*weight, axis=-1)
+    N[5] = np.add.reduce(t82*weight, axis=-1)
+    N[6] = np.add.reduce(t83*weight, axis=-1)
+    N[7] = np.add.reduce(t84*weight, axis=-1)
+    N[8] = np.add.reduce(weight*(t30 + t37), axis=-1)
+    N[9] = np.add.reduce(t85*weight, axis=-1)
+    N[10] = np.add.reduce(t86*weight, axis=-1)
+    N[11] = np.add.reduce(t87*weight, axis=-1)
+    N[12] = np.add.reduce(t88*weight, axis=-1)
+    N[13] = np.add.reduce(t89*weight, axis=-1)
+    N[14] = np.add.reduce(t90*weight, axis=-1)
+    N[15] = np.add.reduce(t91*weight, axis=-1)
+    N[16] = np.add.reduce(weight*(t41 + t44), axis=-1)
+    N[17] = np.add.reduce(t93*weight, axis=-1)
+    N[18] = np.add.reduce(t94*weight, axis=-1)
+    N[19] = np.add.reduce(t95*weight, axis=-1)
+    N[20] = np.add.reduce(t97*weight, axis=-1)
+    N[21] = np.add.reduce(t98*weight, axis=-1)
+    N[22] = np.add.reduce(t99*weight, axis=-1)
+    N[23] = np.add.reduce(t100*weight, axis=-1)
+    N[24] = np.add.reduce(t101*weight, axis=-1)
+    N[25] = np.add.reduce(t102*weight, axis=-1)
+    N[26] = np.add.reduce(t103*weight, axis=-1)
+    N[27] = np.add.reduce(t104*weight, axis=-1)
+    N[28] = np.add.reduce(t105*weight, axis=-1)
+    N[29] = np.add.reduce(weight*(t53 + t56), axis=-1)
+    N[30] = np.add.reduce(t106*weight, axis=-1)
+    N[31] = np.add.reduce(t107*weight, axis=-1)
+    N[32] = np.add.reduce(t108*weight, axis=-1)
+    N[33] = np.add.reduce(t109*weight, axis=-1)
+    N[34] = np.add.reduce(weight*(t59 + t61), axis=-1)
+    N[35] = np.add.reduce(t111*weight, axis=-1)
+    N[36] = np.add.reduce(t112*weight, axis=-1)
+    N[37] = np.add.reduce(t113*weight, axis=-1)
+    N[38] = np.add.reduce(t114*weight, axis=-1)
+    N[39] = np.add.reduce(t116*weight, axis=-1)
+    N[40] = np.add.reduce(t118*weight, axis=-1)
+    N[41] = np.add.reduce(t119*weight, axis=-1)
+    N[42] = np.add.reduce(t121*weight, axis=-1)
+    N[43] = np.add.reduce(t122*weight, axis=-1)
+    N[44] = np.add.reduce(t123, axis=-1)
+    H[0] = np.add.reduce(curvature*t38*t38 + weight*(t77 + t129*(3.0*t115*t128*t18*t3 - t127 - t115*t126) + t134*(3.0*t133*t18*t20*t92 - t132 - t13*t131)), axis=-1)
+    H[1] = np.add.reduce(t135*t45 + weight*(t78 + t129*(3.0*q1_0*q1_1*t128*t18*t3 - t139 - t137*t138) + t134*(3.0*t12*t133*t16*t18*t92 - t140*t141 - t142*t143)), axis=-1)
+    H[2] = np.add.reduce(t135*t50 + weight*(t79 + t129*(q1_0*q2_0*t26*t47 - t137 - t28 - t144*t147) - t143*t148), axis=-1)
+    H[3] = np.add.reduce(t135*t57 + weight*(t80 + t129*(3.0*t115*t128*t18*t2*t6 - t115*t149 - t115*t151) + t134*(3.0*q2_0*q2_1*t133*t18*t20 - t155 - t153*t154)), axis=-1)
+    H[4] = np.add.reduce(t135*t62 + weight*(t161 + t81), axis=-1)
+    H[5] = np.add.reduce(t135*t66 + weight*(t165 + t82 + t129*(q1_0*q2_0*t26*t63 - t157 - t144*t163)), axis=-1)
+    H[6] = np.add.reduce(t135*t71 + weight*(t83 + t134*(q1_0*q2_0*t33*t68 - t153 - t35 - t159*t168) - t115*t170), axis=-1)
+    H[7] = np.add.reduce(t135*t75 + weight*(t174 + t84 + t134*(q1_0*q2_0*t33*t72 - t160 - t159*t172)), axis=-1)
+    H[8] = np.add.reduce(t135*t76 + weight*(t24*t29 + t31*t36 - t164 - t173), axis=-1)
+    H[9] = np.add.reduce(curvature*t45*t45 + weight*(t85 + t129*(3.0*t120*t128*t18*t3 - t175 - t120*t126) + t134*(3.0*t133*t18*t21*t92 - t132 - t131*t17)), axis=-1)
+    H[10] = np.add.reduce(t176*t50 + weight*(t86 + t129*(q1_1*q2_0*t26*t47 - t39 - t147*t177 - q1_1*t124*t2) - t141*t148), axis=-1)
+    H[11] = np.add.reduce(t176*t57 + weight*(t161 + t87), axis=-1)
+    H[12] = np.add.reduce(t176*t62 + weight*(t88 + t129*(3.0*t120*t128*t18*t2*t6 - t120*t149 - t120*t151) + t134*(3.0*q2_0*q2_1*t133*t18*t21 - t155 - t154*t178)), axis=-1)
+    H[13] = np.add.reduce(t176*t66 + weight*(t181 + t89 + t129*(q1_1*q2_0*t26*t63 - q1_1*t151 - t163*t177)), axis=-1)
+    H[14] = np.add.reduce(t176*t71 + weight*(t174 + t90 + t134*(q1_1*q2_0*t33*t68 - t158 - t168*t182)), axis=-1)
+    H[15] = np.add.reduce(t176*t75 + weight*(t91 + t134*(q1_1*q2_0*t33*t72 - t178 - t35 - t172*t182) - t120*t170), axis=-1)
+    H[16] = np.add.reduce(t176*t76 + weight*(t24*t40 + t31*t43 - t180 - q1_1*t170), axis=-1)
+    H[17] = np.add.reduce(curvature*t50*t50 + weight*(t93 + t129*(t183 + t125*t47 + t145*t184)), axis=-1)
+    H[18] = np.add.reduce(t185*t57 + weight*(t165 + t94 + t129*(q1_0*q2_1*t26*t47 - t156 - q1_0*t186)), axis=-1)
+    H[19] = np.add.reduce(t185*t62 + weight*(t181 + t95 + t129*(q1_1*q2_1*t26*t47 - q1_1*t149 - q1_1*t186)), axis=-1)
+    H[20] = np.add.reduce(t185*t66 + weight*(t97 + t129*(t124*t63 + t150*t47 + t162*t184)), axis=-1)
+    H[21] = np.add.reduce(t185*t71 + weight*(t98 + q1_0*t187 + q2_0*t188), axis=-1)
+    H[22] = np.add.reduce(t185*t75 + weight*(t99 + q1_1*t187 + q2_0*t189), axis=-1)
+    H[23] = np.add.reduce(t185*t76 + weight*(t100 + t187), axis=-1)
+    H[24] = np.add.reduce(curvature*t57*t57 + weight*(t101 + t129*(3.0*t115*t128*t18*t7 - t127 - t115*t191) + t134*(3.0*t110*t133*t18*t20 - t193 - t13*t192)), axis=-1)
+    H[25] = np.add.reduce(t194*t62 + weight*(t102 + t129*(3.0*q1_0*q1_1*t128*t18*t7 - t139 - t138*t195) + t134*(3.0*t110*t12*t133*t16*t18 - t110*t196 - t142*t197)), axis=-1)
+    H[26] = np.add.reduce(t194*t66 + weight*(t103 + t129*(q1_0*q2_1*t26*t63 - t195 - t28 - q1_0*t198) - t148*t197), axis=-1)
+    H[27] = np.add.reduce(t194*t71 + weight*(t104 + t134*(q1_0*q2_1*t33*t68 - t54 - t13*t199 - t168*t200) - t115*t201), axis=-1)
+    H[28] = np.add.reduce(t194*t75 + weight*(t105 + t203 + t134*(q1_0*q2_1*t33*t72 - t142*t200 - t172*t200)), axis=-1)
+    H[29] = np.add.reduce(t194*t76 + weight*(t24*t52 + t31*t55 - t202 - t148*t200), axis=-1)
+    H[30] = np.add.reduce(curvature*t62*t62 + weight*(t106 + t129*(3.0*t120*t128*t18*t7 - t175 - t120*t191) + t134*(3.0*t110*t133*t18*t21 - t193 - t17*t192)), axis=-1)
+    H[31] = np.add.reduce(t204*t66 + weight*(t107 + t129*(q1_1*q2_1*t26*t63 - t39 - q1_1*t198 - q1_1*t150*t6) - t110*t179), axis=-1)
+    H[32] = np.add.reduce(t204*t71 + weight*(t108 + t203 + t134*(q1_1*q2_1*t33*t68 - q2_1*t196 - t168*t205)), axis=-1)
+    H[33] = np.add.reduce(t204*t75 + weight*(t109 + t134*(q1_1*q2_1*t33*t72 - t54 - t17*t199 - t172*t205) - t120*t201), axis=-1)
+    H[34] = np.add.reduce(t204*t76 + weight*(t24*t58 + t31*t60 - q1_1*t201 - q2_1*t179), axis=-1)
+    H[35] = np.add.reduce(curvature*t66*t66 + weight*(t111 + t129*(t183 + t163*t63 + t190*t63)), axis=-1)
+    H[36] = np.add.reduce(t207*t71 + weight*(t112 + q1_0*t206 + q2_1*t188), axis=-1)
+    H[37] = np.add.reduce(t207*t75 + weight*(t113 + q1_1*t206 + q2_1*t189), axis=-1)
+    H[38] = np.add.reduce(t207*t76 + weight*(t114 + t206), axis=-1)
+    H[39] = np.add.reduce(curvature*t71*t71 + weight*(t116 + t134*(t208 + 2.0*t140*t68 + t166*t209)), axis=-1)
+    H[40] = np.add.reduce(t210*t75 + weight*(t118 + t134*(t140*t72 + t142*t68 + t171*t209)), axis=-1)
+    H[41] = np.add.reduce(t210*t76 + weight*(t119 + t188), axis=-1)
+    H[42] = np.add.reduce(curvature*t75*t75 + weight*(t121 + t134*(t208 + 2.0*t142*t72 + t172*t72)), axis=-1)
+    H[43] = np.add.reduce(weight*(t122 + t189) + curvature*t75*t76, axis=-1)
+    H[44] = np.add.reduce(t123 + curvature*t76*t76, axis=-1)
 
 
 def sampson(F, q1, q2, r, dr_dF):
@@ -501,12 +591,12 @@ def sampson(F, q1, q2, r, dr_dF):
     dr_dF[0, 8] = t6
 
 
-def sampson_gauss_newton(F, q1, q2, weight, g, N):
-    # Formula: gradient and Gauss-Newton matrix (upper triangle) by vect(F) of the weighted sum
-    # of squared sampson residuals, halved.
+def sampson_gauss_newton(F, q1, q2, weight, cost, g, N):
+    # Formula: half the weighted sum of squared sampson residuals, its gradient and Gauss-Newton
+    # matrix (upper triangle) by vect(F).
     # Inputs:  F (3, 3) shared, q1 (2,), q2 (2,), weight ()
-    # Outputs: g (9,) summed, N (45,) summed
-    # Operations: 147, temporaries: 34.
+    # Outputs: cost () summed, g (9,) summed, N (45,) summed
+    # Operations: 150, temporaries: 34.
     F00 = F[0, 0]
     F01 = F[0, 1]
     F02 = F[0, 2]
@@ -521,101 +611,102 @@ def sampson_gauss_newton(F, q1, q2, weight, g, N):
     q2_0 = q2[0]
     q2_1 = q2[1]
     t0 = F20 + F00*q2_0 + F10*q2_1
-    t3 = F02 + F00*q1_0 + F01*q1_1
     t1 = F21 + F01*q2_0 + F11*q2_1
+    t2 = F22 + F02*q2_0 + F12*q2_1 + q1_0*t0 + q1_1*t1
+    t3 = F02 + F00*q1_0 + F01*q1_1
     t4 = F12 + F10*q1_0 + F11*q1_1
     t5 = t0*t0 + t1*t1 + t3*t3 + t4*t4
-    t6 = 1.0/np.sqrt(t5)
-    t7 = q2_0*t6
-    t2 = F22 + F02*q2_0 + F12*q2_1 + q1_0*t0 + q1_1*t1
-    t8 = t2/(t5*np.sqrt(t5))
-    t9 = q1_0*t7 + t8*(-q1_0*t3 - q2_0*t0)
-    t10 = t9*weight
-    t11 = t10*t6
-    t12 = q1_1*t7 + t8*(-q1_1*t3 - q2_0*t1)
-    t13 = t12*weight
-    t14 = t13*t6
-    t15 = t7 - t3*t8
-    t16 = t15*weight
-    t17 = t16*t6
-    t18 = q2_1*t6
-    t19 = q1_0*t18 + t8*(-q1_0*t4 - q2_1*t0)
-    t20 = t19*weight
-    t21 = t20*t6
-    t22 = q1_1*t18 + t8*(-q1_1*t4 - q2_1*t1)
-    t23 = t22*weight
-    t24 = t23*t6
-    t25 = t18 - t4*t8
-    t26 = t25*weight
-    t27 = t26*t6
-    t28 = q1_0*t6 - t0*t8
-    t29 = t28*weight
-    t30 = t29*t6
-    t31 = q1_1*t6 - t1*t8
-    t32 = t31*t6*weight
-    t33 = weight/t5
-    g[0] = np.add.reduce(t11*t2, axis=-1)
-    g[1] = np.add.reduce(t14*t2, axis=-1)
-    g[2] = np.add.reduce(t17*t2, axis=-1)
-    g[3] = np.add.reduce(t2*t21, axis=-1)
-    g[4] = np.add.reduce(t2*t24, axis=-1)
-    g[5] = np.add.reduce(t2*t27, axis=-1)
-    g[6] = np.add.reduce(t2*t30, axis=-1)
-    g[7] = np.add.reduce(t2*t32, axis=-1)
-    g[8] = np.add.reduce(t2*t33, axis=-1)
-    N[0] = np.add.reduce(t9*t9*weight, axis=-1)
-    N[1] = np.add.reduce(t10*t12, axis=-1)
-    N[2] = np.add.reduce(t10*t15, axis=-1)
-    N[3] = np.add.reduce(t10*t19, axis=-1)
-    N[4] = np.add.reduce(t10*t22, axis=-1)
-    N[5] = np.add.reduce(t10*t25, axis=-1)
-    N[6] = np.add.reduce(t10*t28, axis=-1)
-    N[7] = np.add.reduce(t10*t31, axis=-1)
-    N[8] = np.add.reduce(t11, axis=-1)
-    N[9] = np.add.reduce(t12*t12*weight, axis=-1)
-    N[10] = np.add.reduce(t13*t15, axis=-1)
-    N[11] = np.add.reduce(t13*t19, axis=-1)
-    N[12] = np.add.reduce(t13*t22, axis=-1)
-    N[13] = np.add.reduce(t13*t25, axis=-1)
-    N[14] = np.add.reduce(t13*t28, axis=-1)
-    N[15] = np.add.reduce(t13*t31, axis=-1)
-    N[16] = np.add.reduce(t14, axis=-1)
-    N[17] = np.add.reduce(t15*t15*weight, axis=-1)
-    N[18] = np.add.reduce(t16*t19, axis=-1)
-    N[19] = np.add.reduce(t16*t22, axis=-1)
-    N[20] = np.add.reduce(t16*t25, axis=-1)
-    N[21] = np.add.reduce(t16*t28, axis=-1)
-    N[22] = np.add.reduce(t16*t31, axis=-1)
-    N[23] = np.add.reduce(t17, axis=-1)
-    N[24] = np.add.reduce(t19*t19*weight, axis=-1)
-    N[25] = np.add.reduce(t20*t22, axis=-1)
-    N[26] = np.add.reduce(t20*t25, axis=-1)
-    N[27] = np.add.reduce(t20*t28, axis=-1)
-    N[28] = np.add.reduce(t20*t31, axis=-1)
-    N[29] = np.add.reduce(t21, axis=-1)
-    N[30] = np.add.reduce(t22*t22*weight, axis=-1)
-    N[31] = np.add.reduce(t23*t25, axis=-1)
-    N[32] = np.add.reduce(t23*t28, axis=-1)
-    N[33] = np.add.reduce(t23*t31, axis=-1)
-    N[34] = np.add.reduce(t24, axis=-1)
-    N[35] = np.add.reduce(t25*t25*weight, axis=-1)
-    N[36] = np.add.reduce(t26*t28, axis=-1)
-    N[37] = np.add.reduce(t26*t31, axis=-1)
-    N[38] = np.add.reduce(t27, axis=-1)
-    N[39] = np.add.reduce(t28*t28*weight, axis=-1)
-    N[40] = np.add.reduce(t29*t31, axis=-1)
-    N[41] = np.add.reduce(t30, axis=-1)
-    N[42] = np.add.reduce(t31*t31*weight, axis=-1)
-    N[43] = np.add.reduce(t32, axis=-1)
-    N[44] = np.add.reduce(t33, axis=-1)
+    t6 = weight/t5
+    t7 = 1.0/np.sqrt(t5)
+    t8 = q2_0*t7
+    t9 = t2/(t5*np.sqrt(t5))
+    t10 = q1_0*t8 + t9*(-q1_0*t3 - q2_0*t0)
+    t11 = t10*weight
+    t12 = t11*t7
+    t13 = q1_1*t8 + t9*(-q1_1*t3 - q2_0*t1)
+    t14 = t13*weight
+    t15 = t14*t7
+    t16 = t8 - t3*t9
+    t17 = t16*weight
+    t18 = t17*t7
+    t19 = q2_1*t7
+    t20 = q1_0*t19 + t9*(-q1_0*t4 - q2_1*t0)
+    t21 = t20*weight
+    t22 = t21*t7
+    t23 = q1_1*t19 + t9*(-q1_1*t4 - q2_1*t1)
+    t24 = t23*weight
+    t25 = t24*t7
+    t26 = t19 - t4*t9
+    t27 = t26*weight
+    t28 = t27*t7
+    t29 = q1_0*t7 - t0*t9
+    t30 = t29*weight
+    t31 = t30*t7
+    t32 = q1_1*t7 - t1*t9
+    t33 = t32*t7*weight
+    cost[...] = np.add.reduce(0.5*t2*t2*t6, axis=-1)
+    g[0] = np.add.reduce(t12*t2, axis=-1)
+    g[1] = np.add.reduce(t15*t2, axis=-1)
+    g[2] = np.add.reduce(t18*t2, axis=-1)
+    g[3] = np.add.reduce(t2*t22, axis=-1)
+    g[4] = np.add.reduce(t2*t25, axis=-1)
+    g[5] = np.add.reduce(t2*t28, axis=-1)
+    g[6] = np.add.reduce(t2*t31, axis=-1)
+    g[7] = np.add.reduce(t2*t33, axis=-1)
+    g[8] = np.add.reduce(t2*t6, axis=-1)
+    N[0] = np.add.reduce(t10*t10*weight, axis=-1)
+    N[1] = np.add.reduce(t11*t13, axis=-1)
+    N[2] = np.add.reduce(t11*t16, axis=-1)
+    N[3] = np.add.reduce(t11*t20, axis=-1)
+    N[4] = np.add.reduce(t11*t23, axis=-1)
+    N[5] = np.add.reduce(t11*t26, axis=-1)
+    N[6] = np.add.reduce(t11*t29, axis=-1)
+    N[7] = np.add.reduce(t11*t32, axis=-1)
+    N[8] = np.add.reduce(t12, axis=-1)
+    N[9] = np.add.reduce(t13*t13*weight, axis=-1)
+    N[10] = np.add.reduce(t14*t16, axis=-1)
+    N[11] = np.add.reduce(t14*t20, axis=-1)
+    N[12] = np.add.reduce(t14*t23, axis=-1)
+    N[13] = np.add.reduce(t14*t26, axis=-1)
+    N[14] = np.add.reduce(t14*t29, axis=-1)
+    N[15] = np.add.reduce(t14*t32, axis=-1)
+    N[16] = np.add.reduce(t15, axis=-1)
+    N[17] = np.add.reduce(t16*t16*weight, axis=-1)
+    N[18] = np.add.reduce(t17*t20, axis=-1)
+    N[19] = np.add.reduce(t17*t23, axis=-1)
+    N[20] = np.add.reduce(t17*t26, axis=-1)
+    N[21] = np.add.reduce(t17*t29, axis=-1)
+    N[22] = np.add.reduce(t17*t32, axis=-1)
+    N[23] = np.add.reduce(t18, axis=-1)
+    N[24] = np.add.reduce(t20*t20*weight, axis=-1)
+    N[25] = np.add.reduce(t21*t23, axis=-1)
+    N[26] = np.add.reduce(t21*t26, axis=-1)
+    N[27] = np.add.reduce(t21*t29, axis=-1)
+    N[28] = np.add.reduce(t21*t32, axis=-1)
+    N[29] = np.add.reduce(t22, axis=-1)
+    N[30] = np.add.reduce(t23*t23*weight, axis=-1)
+    N[31] = np.add.reduce(t24*t26, axis=-1)
+    N[32] = np.add.reduce(t24*t29, axis=-1)
+    N[33] = np.add.reduce(t24*t32, axis=-1)
+    N[34] = np.add.reduce(t25, axis=-1)
+    N[35] = np.add.reduce(t26*t26*weight, axis=-1)
+    N[36] = np.add.reduce(t27*t29, axis=-1)
+    N[37] = np.add.reduce(t27*t32, axis=-1)
+    N[38] = np.add.reduce(t28, axis=-1)
+    N[39] = np.add.reduce(t29*t29*weight, axis=-1)
+    N[40] = np.add.reduce(t30*t32, axis=-1)
+    N[41] = np.add.reduce(t31, axis=-1)
+    N[42] = np.add.reduce(t32*t32*weight, axis=-1)
+    N[43] = np.add.reduce(t33, axis=-1)
+    N[44] = np.add.reduce(t6, axis=-1)
 
 
-def sampson_newton(F, q1, q2, weight, curvature, g, H):
-    # Formula: gradient and exact Hessian (upper triangle) by vect(F) of a robust sum of squared
-    # sampson residuals, halved.
+def sampson_newton(F, q1, q2, weight, curvature, cost, g, N, H):
+    # Formula: half the weighted sum of squared sampson residuals, and by vect(F) the gradient,
+    # the Gauss-Newton matrix and exact Hessian (upper triangles) of their robust sum, halved.
     # Inputs:  F (3, 3) shared, q1 (2,), q2 (2,), weight (), curvature ()
-    # Outputs: g (9,) summed, H (45,) summed
-    # Operations: 648, temporaries: 153.
+    # Outputs: cost () summed, g (9,) summed, N (45,) summed, H (45,) summed
+    # Operations: 693, temporaries: 161.
     F00 = F[0, 0]
     F01 = F[0, 1]
     F02 = F[0, 2]
@@ -629,210 +720,264 @@ def sampson_newton(F, q1, q2, weight, curvature, g, H):
     q1_1 = q1[1]
     q2_0 = q2[0]
     q2_1 = q2[1]
-    t10 = F11*q1_1
-    t9 = F10*q1_0
-    t11 = F12 + t10 + t9
-    t0 = F00*q1_0
-    t1 = F01*q1_1
-    t2 = F02 + t0 + t1
-    t3 = F00*q2_0
-    t4 = F10*q2_1
-    t5 = F20 + t3 + t4
-    t6 = F01*q2_0
-    t7 = F11*q2_1
-    t8 = F21 + t6 + t7
-    t12 = t11*t11 + t2*t2 + t5*t5 + t8*t8
-    t13 = 1.0/np.sqrt(t12)
-    t14 = q2_0*t13
-    t15 = q1_0*t2
-    t16 = q2_0*t5
-    t17 = -t15 - t16
-    t18 = F22 + F02*q2_0 + F12*q2_1 + q1_0*t5 + q1_1*t8
-    t19 = 1.0/(t12*np.sqrt(t12))
-    t20 = t18*t19
-    t21 = q1_0*t14 + t17*t20
-    t22 = t13*t21
-    t23 = t18*weight
-    t24 = q1_1*t2
-    t25 = q2_0*t8
-    t26 = -t24 - t25
-    t27 = q1_1*t14 + t20*t26
-    t28 = t13*t27
-    t29 = -t2
-    t30 = t14 + t20*t29
-    t31 = t13*t30
-    t32 = q2_1*t13
-    t33 = q1_0*t11
-    t34 = q2_1*t5
-    t35 = -t33 - t34
-    t36 = q1_0*t32 + t20*t35
-    t37 = t13*t36
-    t38 = q1_1*t11
-    t39 = q2_1*t8
+    t8 = F00*q1_0
+    t9 = F01*q1_1
+    t10 = F02 + t8 + t9
+    t11 = F10*q1_0
+    t12 = F11*q1_1
+    t13 = F12 + t11 + t12
+    t0 = F00*q2_0
+    t1 = F10*q2_1
+    t2 = F20 + t0 + t1
+    t3 = F01*q2_0
+    t4 = F11*q2_1
+    t5 = F21 + t3 + t4
+    t14 = t10*t10 + t13*t13 + t2*t2 + t5*t5
+    t15 = 1.0/t14
+    t16 = t15*weight
+    t6 = F22 + F02*q2_0 + F12*q2_1 + q1_0*t2 + q1_1*t5
+    t7 = t6*t6
+    t17 = 1.0/np.sqrt(t14)
+    t18 = q2_0*t17
+    t19 = q1_0*t10
+    t20 = q2_0*t2
+    t21 = -t19 - t20
+    t22 = 1.0/(t14*np.sqrt(t14))
+    t23 = t22*t6
+    t24 = q1_0*t18 + t21*t23
+    t25 = t17*t24
+    t26 = t25*weight
+    t27 = q1_1*t10
+    t28 = q2_0*t5
+    t29 = -t27 - t28
+    t30 = q1_1*t18 + t23*t29
+    t31 = t17*t30
+    t32 = t31*weight
+    t33 = -t10
+    t34 = t18 + t23*t33
+    t35 = t17*t34
+    t36 = t35*weight
+    t37 = q2_1*t17
+    t38 = q1_0*t13
+    t39 = q2_1*t2
     t40 = -t38 - t39
-    t41 = q1_1*t32 + t20*t40
-    t42 = t13*t41
-    t43 = -t11
-    t44 = t32 + t20*t43
-    t45 = t13*t44
-    t46 = -t5
-    t47 = q1_0*t13 + t20*t46
-    t48 = t13*t47
-    t49 = -t8
-    t50 = q1_1*t13 + t20*t49
-    t51 = t13*t50
-    t52 = 1.0/t12
+    t41 = q1_0*t37 + t23*t40
+    t42 = t17*t41
+    t43 = t42*weight
+    t44 = q1_1*t13
+    t45 = q2_1*t5
+    t46 = -t44 - t45
+    t47 = q1_1*t37 + t23*t46
+    t48 = t17*t47
+    t49 = t48*weight
+    t50 = -t13
+    t51 = t37 + t23*t50
+    t52 = t17*t51
     t53 = t52*weight
-    t54 = t21*t21
-    t55 = curvature*t18*t18
-    t56 = t52*t55
-    t57 = t17*t19
-    t58 = q2_0*t57
-    t59 = 2.0*q1_0
-    t60 = q1_0*q1_0
-    t61 = q2_0*q2_0
-    t62 = t18/(t12*t12*np.sqrt(t12))
-    t63 = t17*t62
-    t64 = t13*t18
-    t65 = t21*t27
-    t66 = t19*t26
-    t67 = q2_0*t66
-    t68 = q1_0*t20
-    t69 = -q1_1*t68
-    t70 = -3.0*t24 - 3.0*t25
-    t71 = t21*t30
-    t72 = q2_0*t19
-    t73 = t29*t72
-    t74 = -t68
-    t75 = -3.0*F02 - 3.0*t0 - 3.0*t1
-    t76 = t21*t36
-    t77 = t35*t72
-    t78 = q2_1*t57
-    t79 = q2_0*t20
-    t80 = -q2_1*t79
-    t81 = -3.0*t33 - 3.0*t34
-    t82 = t21*t41
-    t83 = t40*t72
-    t84 = -3.0*t38 - 3.0*t39
-    t85 = t21*t44
-    t86 = t43*t72
-    t87 = -3.0*F12 - 3.0*t10 - 3.0*t9
-    t88 = t21*t47
-    t89 = t46*t72
-    t90 = -t79
-    t91 = -3.0*F20 - 3.0*t3 - 3.0*t4
-    t92 = t21*t50
-    t93 = t49*t72
-    t94 = -3.0*F21 - 3.0*t6 - 3.0*t7
-    t95 = t19*t55
-    t96 = 1.0/(t12*t12)
-    t97 = t18*t96
-    t100 = q1_1*q1_1
-    t101 = t26*t62
-    t98 = t27*t27
-    t99 = 2.0*q1_1
-    t102 = t27*t30
-    t103 = -q1_1*t20
-    t104 = t27*t36
-    t105 = q2_1*t66
-    t106 = t27*t41
-    t107 = t27*t44
-    t108 = t27*t47
-    t109 = t27*t50
-    t110 = t30*t30
-    t111 = -t20
-    t112 = t29*t62
-    t113 = t30*t36
-    t114 = t19*t29
-    t115 = q2_1*t114
-    t116 = t30*t41
-    t117 = t30*t44
-    t118 = t30*t47
-    t119 = t30*t50
-    t120 = t36*t36
-    t121 = t19*t35
-    t122 = q2_1*t121
-    t123 = q2_1*q2_1
-    t124 = t35*t62
-    t125 = t36*t41
-    t126 = t19*t40
-    t127 = q2_1*t126
-    t128 = t36*t44
-    t129 = t19*t43
-    t130 = q1_0*t129
-    t131 = t36*t47
-    t132 = q2_1*t19
-    t133 = t132*t46
-    t134 = -q2_1*t20
-    t135 = t36*t50
-    t136 = t132*t49
-    t137 = t41*t41
-    t138 = t40*t62
-    t139 = t41*t44
-    t140 = q1_1*t129
-    t141 = t41*t47
-    t142 = t41*t50
-    t143 = t44*t44
-    t144 = t43*t62
-    t145 = t44*t47
-    t146 = t44*t50
-    t147 = t47*t47
-    t148 = q1_0*t19
-    t149 = t46*t62
-    t150 = t47*t50
-    t151 = q1_1*t19
-    t152 = t50*t50
-    g[0] = np.add.reduce(t22*t23, axis=-1)
-    g[1] = np.add.reduce(t23*t28, axis=-1)
-    g[2] = np.add.reduce(t23*t31, axis=-1)
-    g[3] = np.add.reduce(t23*t37, axis=-1)
-    g[4] = np.add.reduce(t23*t42, axis=-1)
-    g[5] = np.add.reduce(t23*t45, axis=-1)
-    g[6] = np.add.reduce(t23*t48, axis=-1)
-    g[7] = np.add.reduce(t23*t51, axis=-1)
-    g[8] = np.add.reduce(t18*t53, axis=-1)
-    H[0] = np.add.reduce(t54*t56 + weight*(t54 + t64*(t20*(-t60 - t61) + t58*t59 + t63*(-3.0*t15 - 3.0*t16))), axis=-1)
-    H[1] = np.add.reduce(t56*t65 + weight*(t65 + t64*(t69 + q1_0*t67 + q1_1*t58 + t63*t70)), axis=-1)
-    H[2] = np.add.reduce(t56*t71 + weight*(t71 + t64*(t58 + t74 + q1_0*t73 + t63*t75)), axis=-1)
-    H[3] = np.add.reduce(t56*t76 + weight*(t76 + t64*(t80 + q1_0*t77 + q1_0*t78 + t63*t81)), axis=-1)
-    H[4] = np.add.reduce(t56*t82 + weight*(t82 + t64*(q1_0*t83 + q1_1*t78 + t63*t84)), axis=-1)
-    H[5] = np.add.reduce(t56*t85 + weight*(t85 + t64*(t78 + q1_0*t86 + t63*t87)), axis=-1)
-    H[6] = np.add.reduce(t56*t88 + weight*(t88 + t64*(t90 + q1_0*t57 + q1_0*t89 + t63*t91)), axis=-1)
-    H[7] = np.add.reduce(t56*t92 + weight*(t92 + t64*(q1_0*t93 + q1_1*t57 + t63*t94)), axis=-1)
-    H[8] = np.add.reduce(t21*t95 + weight*(t22 + t17*t97), axis=-1)
-    H[9] = np.add.reduce(t56*t98 + weight*(t98 + t64*(t101*t70 + t20*(-t100 - t61) + t67*t99)), axis=-1)
-    H[10] = np.add.reduce(t102*t56 + weight*(t102 + t64*(t103 + t67 + q1_1*t73 + t101*t75)), axis=-1)
-    H[11] = np.add.reduce(t104*t56 + weight*(t104 + t64*(q1_0*t105 + q1_1*t77 + t101*t81)), axis=-1)
-    H[12] = np.add.reduce(t106*t56 + weight*(t106 + t64*(t80 + q1_1*t105 + q1_1*t83 + t101*t84)), axis=-1)
-    H[13] = np.add.reduce(t107*t56 + weight*(t107 + t64*(t105 + q1_1*t86 + t101*t87)), axis=-1)
-    H[14] = np.add.reduce(t108*t56 + weight*(t108 + t64*(q1_0*t66 + q1_1*t89 + t101*t91)), axis=-1)
-    H[15] = np.add.reduce(t109*t56 + weight*(t109 + t64*(t90 + q1_1*t66 + q1_1*t93 + t101*t94)), axis=-1)
-    H[16] = np.add.reduce(t27*t95 + weight*(t28 + t26*t97), axis=-1)
-    H[17] = np.add.reduce(t110*t56 + weight*(t110 + t64*(t111 + 2.0*t73 + t112*t75)), axis=-1)
-    H[18] = np.add.reduce(t113*t56 + weight*(t113 + t64*(t77 + q1_0*t115 + t112*t81)), axis=-1)
-    H[19] = np.add.reduce(t116*t56 + weight*(t116 + t64*(t83 + q1_1*t115 + t112*t84)), axis=-1)
-    H[20] = np.add.reduce(t117*t56 + weight*(t117 + t64*(t115 + t86 + t112*t87)), axis=-1)
-    H[21] = np.add.reduce(t118*t56 + weight*(t118 + t64*(t89 + q1_0*t114 + t112*t91)), axis=-1)
-    H[22] = np.add.reduce(t119*t56 + weight*(t119 + t64*(t93 + q1_1*t114 + t112*t94)), axis=-1)
-    H[23] = np.add.reduce(t30*t95 + weight*(t31 + t29*t97), axis=-1)
-    H[24] = np.add.reduce(t120*t56 + weight*(t120 + t64*(t122*t59 + t124*t81 + t20*(-t123 - t60))), axis=-1)
-    H[25] = np.add.reduce(t125*t56 + weight*(t125 + t64*(t69 + q1_0*t127 + q1_1*t122 + t124*t84)), axis=-1)
-    H[26] = np.add.reduce(t128*t56 + weight*(t128 + t64*(t122 + t74 + q2_1*t130 + t124*t87)), axis=-1)
-    H[27] = np.add.reduce(t131*t56 + weight*(t131 + t64*(t134 + q1_0*t121 + q1_0*t133 + t124*t91)), axis=-1)
-    H[28] = np.add.reduce(t135*t56 + weight*(t135 + t64*(q1_0*t136 + q1_1*t121 + t124*t94)), axis=-1)
-    H[29] = np.add.reduce(t36*t95 + weight*(t37 + t35*t97), axis=-1)
-    H[30] = np.add.reduce(t137*t56 + weight*(t137 + t64*(t127*t99 + t138*t84 + t20*(-t100 - t123))), axis=-1)
-    H[31] = np.add.reduce(t139*t56 + weight*(t139 + t64*(t103 + t127 + q2_1*t140 + t138*t87)), axis=-1)
-    H[32] = np.add.reduce(t141*t56 + weight*(t141 + t64*(q1_0*t126 + q1_1*t133 + t138*t91)), axis=-1)
-    H[33] = np.add.reduce(t142*t56 + weight*(t142 + t64*(t134 + q1_1*t126 + q1_1*t136 + t138*t94)), axis=-1)
-    H[34] = np.add.reduce(t41*t95 + weight*(t42 + t40*t97), axis=-1)
-    H[35] = np.add.reduce(t143*t56 + weight*(t143 + t64*(t111 + 2.0*q2_1*t129 + t144*t87)), axis=-1)
-    H[36] = np.add.reduce(t145*t56 + weight*(t145 + t64*(t130 + t133 + t144*t91)), axis=-1)
-    H[37] = np.add.reduce(t146*t56 + weight*(t146 + t64*(t136 + t140 + t144*t94)), axis=-1)
-    H[38] = np.add.reduce(t44*t95 + weight*(t45 + t43*t97), axis=-1)
-    H[39] = np.add.reduce(t147*t56 + weight*(t147 + t64*(t111 + 2.0*t148*t46 + t149*t91)), axis=-1)
-    H[40] = np.add.reduce(t150*t56 + weight*(t150 + t64*(t148*t49 + t149*t94 + t151*t46)), axis=-1)
-    H[41] = np.add.reduce(t47*t95 + weight*(t48 + t46*t97), axis=-1)
-    H[42] = np.add.reduce(t152*t56 + weight*(t152 + t64*(t111 + 2.0*t151*t49 + t49*t62*t94)), axis=-1)
-    H[43] = np.add.reduce(t50*t95 + weight*(t51 + t49*t97), axis=-1)
-    H[44] = np.add.reduce(t53 + t55*t96, axis=-1)
+    t54 = -t2
+    t55 = q1_0*t17 + t23*t54
+    t56 = t17*t55
+    t57 = t56*weight
+    t58 = -t5
+    t59 = q1_1*t17 + t23*t58
+    t60 = t17*t59
+    t61 = t60*weight
+    t62 = t24*t24
+    t63 = t24*t30
+    t64 = t24*t34
+    t65 = t24*t41
+    t66 = t24*t47
+    t67 = t24*t51
+    t68 = t24*t55
+    t69 = t24*t59
+    t70 = t30*t30
+    t71 = t30*t34
+    t72 = t30*t41
+    t73 = t30*t47
+    t74 = t30*t51
+    t75 = t30*t55
+    t76 = t30*t59
+    t77 = t34*t34
+    t78 = t34*t41
+    t79 = t34*t47
+    t80 = t34*t51
+    t81 = t34*t55
+    t82 = t34*t59
+    t83 = t41*t41
+    t84 = t41*t47
+    t85 = t41*t51
+    t86 = t41*t55
+    t87 = t41*t59
+    t88 = t47*t47
+    t89 = t47*t51
+    t90 = t47*t55
+    t91 = t47*t59
+    t92 = t51*t51
+    t93 = t51*t55
+    t94 = t51*t59
+    t95 = t55*t55
+    t96 = t55*t59
+    t97 = t59*t59
+    t100 = t21*t22
+    t101 = q2_0*t100
+    t102 = 2.0*q1_0
+    t103 = q1_0*q1_0
+    t104 = q2_0*q2_0
+    t105 = t6/(t14*t14*np.sqrt(t14))
+    t106 = t105*t21
+    t107 = t17*t6
+    t98 = curvature*t7
+    t99 = t15*t98
+    t108 = t22*t29
+    t109 = q2_0*t108
+    t110 = q1_0*t23
+    t111 = -q1_1*t110
+    t112 = -3.0*t27 - 3.0*t28
+    t113 = q2_0*t22
+    t114 = t113*t33
+    t115 = -t110
+    t116 = -3.0*F02 - 3.0*t8 - 3.0*t9
+    t117 = t113*t40
+    t118 = q2_1*t100
+    t119 = q2_0*t23
+    t120 = -q2_1*t119
+    t121 = -3.0*t38 - 3.0*t39
+    t122 = t113*t46
+    t123 = -3.0*t44 - 3.0*t45
+    t124 = t113*t50
+    t125 = -3.0*F12 - 3.0*t11 - 3.0*t12
+    t126 = t113*t54
+    t127 = -t119
+    t128 = -3.0*F20 - 3.0*t0 - 3.0*t1
+    t129 = t113*t58
+    t130 = -3.0*F21 - 3.0*t3 - 3.0*t4
+    t131 = t22*t98
+    t132 = 1.0/(t14*t14)
+    t133 = t132*t6
+    t134 = 2.0*q1_1
+    t135 = q1_1*q1_1
+    t136 = t105*t29
+    t137 = -q1_1*t23
+    t138 = q2_1*t108
+    t139 = -t23
+    t140 = t105*t33
+    t141 = t22*t33
+    t142 = q2_1*t141
+    t143 = t22*t40
+    t144 = q2_1*t143
+    t145 = q2_1*q2_1
+    t146 = t105*t40
+    t147 = t22*t46
+    t148 = q2_1*t147
+    t149 = t22*t50
+    t150 = q1_0*t149
+    t151 = q2_1*t22
+    t152 = t151*t54
+    t153 = -q2_1*t23
+    t154 = t151*t58
+    t155 = t105*t46
+    t156 = q1_1*t149
+    t157 = t105*t50
+    t158 = q1_0*t22
+    t159 = t105*t54
+    t160 = q1_1*t22
+    cost[...] = np.add.reduce(0.5*t16*t7, axis=-1)
+    g[0] = np.add.reduce(t26*t6, axis=-1)
+    g[1] = np.add.reduce(t32*t6, axis=-1)
+    g[2] = np.add.reduce(t36*t6, axis=-1)
+    g[3] = np.add.reduce(t43*t6, axis=-1)
+    g[4] = np.add.reduce(t49*t6, axis=-1)
+    g[5] = np.add.reduce(t53*t6, axis=-1)
+    g[6] = np.add.reduce(t57*t6, axis=-1)
+    g[7] = np.add.reduce(t6*t61, axis=-1)
+    g[8] = np.add.reduce(t16*t6, axis=-1)
+    N[0] = np.add.reduce(t62*weight, axis=-1)
+    N[1] = np.add.reduce(t63*weight, axis=-1)
+    N[2] = np.add.reduce(t64*weight, axis=-1)
+    N[3] = np.add.reduce(t65*weight, axis=-1)
+    N[4] = np.add.reduce(t66*weight, axis=-1)
+    N[5] = np.add.reduce(t67*weight, axis=-1)
+    N[6] = np.add.reduce(t68*weight, axis=-1)
+    N[7] = np.add.reduce(t69*weight, axis=-1)
+    N[8] = np.add.reduce(t26, axis=-1)
+    N[9] = np.add.reduce(t70*weight, axis=-1)
+    N[10] = np.add.reduce(t71*weight, axis=-1)
+    N[11] = np.add.reduce(t72*weight, axis=-1)
+    N[12] = np.add.reduce(t73*weight, axis=-1)
+    N[13] = np.add.reduce(t74*weight, axis=-1)
+    N[14] = np.add.reduce(t75*weight, axis=-1)
+    N[15] = np.add.reduce(t76*weight, axis=-1)
+    N[16] = np.add.reduce(t32, axis=-1)
+    N[17] = np.add.reduce(t77*weight, axis=-1)
+    N[18] = np.add.reduce(t78*weight, axis=-1)
+    N[19] = np.add.reduce(t79*weight, axis=-1)
+    N[20] = np.add.reduce(t80*weight, axis=-1)
+    N[21] = np.add.reduce(t81*weight, axis=-1)
+    N[22] = np.add.reduce(t82*weight, axis=-1)
+    N[23] = np.add.reduce(t36, axis=-1)
+    N[24] = np.add.reduce(t83*weight, axis=-1)
+    N[25] = np.add.reduce(t84*weight, axis=-1)
+    N[26] = np.add.reduce(t85*weight, axis=-1)
+    N[27] = np.add.reduce(t86*weight, axis=-1)
+    N[28] = np.add.reduce(t87*weight, axis=-1)
+    N[29] = np.add.reduce(t43, axis=-1)
+    N[30] = np.add.reduce(t88*weight, axis=-1)
+    N[31] = np.add.reduce(t89*weight, axis=-1)
+    N[32] = np.add.reduce(t90*weight, axis=-1)
+    N[33] = np.add.reduce(t91*weight, axis=-1)
+    N[34] = np.add.reduce(t49, axis=-1)
+    N[35] = np.add.reduce(t92*weight, axis=-1)
+    N[36] = np.add.reduce(t93*weight, axis=-1)
+    N[37] = np.add.reduce(t94*weight, axis=-1)
+    N[38] = np.add.reduce(t53, axis=-1)
+    N[39] = np.add.reduce(t95*weight, axis=-1)
+    N[40] = np.add.reduce(t96*weight, axis=-1)
+    N[41] = np.add.reduce(t57, axis=-1)
+    N[42] = np.add.reduce(t97*weight, axis=-1)
+    N[43] = np.add.reduce(t61, axis=-1)
+    N[44] = np.add.reduce(t16, axis=-1)
+    H[0] = np.add.reduce(t62*t99 + weight*(t62 + t107*(t101*t102 + t106*(-3.0*t19 - 3.0*t20) + t23*(-t103 - t104))), axis=-1)
+    H[1] = np.add.reduce(t63*t99 + weight*(t63 + t107*(t111 + q1_0*t109 + q1_1*t101 + t106*t112)), axis=-1)
+    H[2] = np.add.reduce(t64*t99 + weight*(t64 + t107*(t101 + t115 + q1_0*t114 + t106*t116)), axis=-1)
+    H[3] = np.add.reduce(t65*t99 + weight*(t65 + t107*(t120 + q1_0*t117 + q1_0*t118 + t106*t121)), axis=-1)
+    H[4] = np.add.reduce(t66*t99 + weight*(t66 + t107*(q1_0*t122 + q1_1*t118 + t106*t123)), axis=-1)
+    H[5] = np.add.reduce(t67*t99 + weight*(t67 + t107*(t118 + q1_0*t124 + t106*t125)), axis=-1)
+    H[6] = np.add.reduce(t68*t99 + weight*(t68 + t107*(t127 + q1_0*t100 + q1_0*t126 + t106*t128)), axis=-1)
+    H[7] = np.add.reduce(t69*t99 + weight*(t69 + t107*(q1_0*t129 + q1_1*t100 + t106*t130)), axis=-1)
+    H[8] = np.add.reduce(t131*t24 + weight*(t25 + t133*t21), axis=-1)
+    H[9] = np.add.reduce(t70*t99 + weight*(t70 + t107*(t109*t134 + t112*t136 + t23*(-t104 - t135))), axis=-1)
+    H[10] = np.add.reduce(t71*t99 + weight*(t71 + t107*(t109 + t137 + q1_1*t114 + t116*t136)), axis=-1)
+    H[11] = np.add.reduce(t72*t99 + weight*(t72 + t107*(q1_0*t138 + q1_1*t117 + t121*t136)), axis=-1)
+    H[12] = np.add.reduce(t73*t99 + weight*(t73 + t107*(t120 + q1_1*t122 + q1_1*t138 + t123*t136)), axis=-1)
+    H[13] = np.add.reduce(t74*t99 + weight*(t74 + t107*(t138 + q1_1*t124 + t125*t136)), axis=-1)
+    H[14] = np.add.reduce(t75*t99 + weight*(t75 + t107*(q1_0*t108 + q1_1*t126 + t128*t136)), axis=-1)
+    H[15] = np.add.reduce(t76*t99 + weight*(t76 + t107*(t127 + q1_1*t108 + q1_1*t129 + t130*t136)), axis=-1)
+    H[16] = np.add.reduce(t131*t30 + weight*(t31 + t133*t29), axis=-1)
+    H[17] = np.add.reduce(t77*t99 + weight*(t77 + t107*(2.0*t114 + t139 + t116*t140)), axis=-1)
+    H[18] = np.add.reduce(t78*t99 + weight*(t78 + t107*(t117 + q1_0*t142 + t121*t140)), axis=-1)
+    H[19] = np.add.reduce(t79*t99 + weight*(t79 + t107*(t122 + q1_1*t142 + t123*t140)), axis=-1)
+    H[20] = np.add.reduce(t80*t99 + weight*(t80 + t107*(t124 + t142 + t125*t140)), axis=-1)
+    H[21] = np.add.reduce(t81*t99 + weight*(t81 + t107*(t126 + q1_0*t141 + t128*t140)), axis=-1)
+    H[22] = np.add.reduce(t82*t99 + weight*(t82 + t107*(t129 + q1_1*t141 + t130*t140)), axis=-1)
+    H[23] = np.add.reduce(t131*t34 + weight*(t35 + t133*t33), axis=-1)
+    H[24] = np.add.reduce(t83*t99 + weight*(t83 + t107*(t102*t144 + t121*t146 + t23*(-t103 - t145))), axis=-1)
+    H[25] = np.add.reduce(t84*t99 + weight*(t84 + t107*(t111 + q1_0*t148 + q1_1*t144 + t123*t146)), axis=-1)
+    H[26] = np.add.reduce(t85*t99 + weight*(t85 + t107*(t115 + t144 + q2_1*t150 + t125*t146)), axis=-1)
+    H[27] = np.add.reduce(t86*t99 + weight*(t86 + t107*(t153 + q1_0*t143 + q1_0*t152 + t128*t146)), axis=-1)
+    H[28] = np.add.reduce(t87*t99 + weight*(t87 + t107*(q1_0*t154 + q1_1*t143 + t130*t146)), axis=-1)
+    H[29] = np.add.reduce(t131*t41 + weight*(t42 + t133*t40), axis=-1)
+    H[30] = np.add.reduce(t88*t99 + weight*(t88 + t107*(t123*t155 + t134*t148 + t23*(-t135 - t145))), axis=-1)
+    H[31] = np.add.reduce(t89*t99 + weight*(t89 + t107*(t137 + t148 + q2_1*t156 + t125*t155)), axis=-1)
+    H[32] = np.add.reduce(t90*t99 + weight*(t90 + t107*(q1_0*t147 + q1_1*t152 + t128*t155)), axis=-1)
+    H[33] = np.add.reduce(t91*t99 + weight*(t91 + t107*(t153 + q1_1*t147 + q1_1*t154 + t130*t155)), axis=-1)
+    H[34] = np.add.reduce(t131*t47 + weight*(t48 + t133*t46), axis=-1)
+    H[35] = np.add.reduce(t92*t99 + weight*(t92 + t107*(t139 + 2.0*q2_1*t149 + t125*t157)), axis=-1)
+    H[36] = np.add.reduce(t93*t99 + weight*(t93 + t107*(t150 + t152 + t128*t157)), axis=-1)
+    H[37] = np.add.reduce(t94*t99 + weight*(t94 + t107*(t154 + t156 + t130*t157)), axis=-1)
+    H[38] = np.add.reduce(t131*t51 + weight*(t52 + t133*t50), axis=-1)
+    H[39] = np.add.reduce(t95*t99 + weight*(t95 + t107*(t139 + t128*t159 + 2.0*t158*t54)), axis=-1)
+    H[40] = np.add.reduce(t96*t99 + weight*(t96 + t107*(t130*t159 + t158*t58 + t160*t54)), axis=-1)
+    H[41] = np.add.reduce(t131*t55 + weight*(t56 + t133*t54), axis=-1)
+    H[42] = np.add.reduce(t97*t99 + weight*(t97 + t107*(t139 + 2.0*t160*t58 + t105*t130*t58)), axis=-1)
+    H[43] = np.add.reduce(t131*t59 + weight*(t60 + t133*t58), axis=-1)
+    H[44] = np.add.reduce(t16 + t132*t98, axis=-1)

@@ -52,12 +52,12 @@ def bilinear_frame(F, R1, R2, s, b1, b2, f):
 
 
 def foot_point(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
-    # Formula: multiplier l of the foot point by 2 passes of bracketed Newton from the Sampson
-    # correction, its last change, and the signed distance d = l |n|.
+    # Formula: multiplier l of the foot point by 2 passes of Newton from the Sampson correction,
+    # its last change, and the signed distance d = l |n|.
     # Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
     # f () shared, q1 (2,), q2 (2,)
     # Outputs: multiplier (), last_change (), d ()
-    # Operations: 216, temporaries: 56.
+    # Operations: 188, temporaries: 53.
     R1_00 = R1[0, 0]
     R1_01 = R1[0, 1]
     R1_10 = R1[1, 0]
@@ -76,7 +76,6 @@ def foot_point(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
     q1_1 = q1[1]
     q2_0 = q2[0]
     q2_1 = q2[1]
-    pole = 0.9999999999999858/(1e-140 + s0)
     a1_0 = R1_00*q1_0 + R1_10*q1_1
     a1_1 = R1_01*q1_0 + R1_11*q1_1
     a2_0 = R2_00*q2_0 + R2_10*q2_1
@@ -95,50 +94,132 @@ def foot_point(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
     t7 = b1_1 + a2_1*s1 - t3
     hh3 = 0.5*t7*t7
     start = C0/(1e-300 + hh0 + hh1 + hh2 + hh3)
-    l = np.where((-pole - start)*(pole - start) > 0.0, 0.0, start)
-    low = np.where(C0 > 0.0, 0.0, -pole)
-    high = np.where(C0 > 0.0, pole, 0.0)
+    l = start
     change = 0.0
     for _ in range(2):
         t8 = l*s0
         below0 = 1.0 - t8
         above0 = 1.0 + t8
-        inverse0 = 1.0/(above0*below0)
+        pair0 = above0*below0
+        t9 = l*s1
+        above1 = 1.0 + t9
+        below1 = 1.0 - t9
+        pair1 = above1*below1
+        inverse = 1.0/(pair0*pair1)
+        inverse0 = inverse*pair1
         r0 = below0*inverse0
         r1 = above0*inverse0
-        t9 = l*s1
-        below1 = 1.0 - t9
-        above1 = 1.0 + t9
-        inverse1 = 1.0/(above1*below1)
+        inverse1 = inverse*pair0
         r2 = below1*inverse1
         r3 = above1*inverse1
-        t10 = 0.5*t8
-        t11 = 0.5*t9
-        value = C0 - hh0*l*r0*r0*(1.0 + t10) - hh1*l*r1*r1*(1.0 - t10) - hh2*l*r2*r2*(1.0 + t11) - hh3*l*r3*r3*(1.0 - t11)
-        high_new = np.where(value > 0.0, high, l)
-        low_new = np.where(value > 0.0, l, low)
-        step = value/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3)
-        t12 = l + step
-        moved = np.where((high_new - t12)*(low_new - t12) > 0.0, 0.5*high_new + 0.5*low_new, t12)
-        t13 = moved - l
-        l = moved
-        low = low_new
-        high = high_new
-        change = t13
-    t14 = l*s0
-    below0 = 1.0 - t14
-    above0 = 1.0 + t14
-    inverse0 = 1.0/(above0*below0)
+        newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3)
+        t10 = l + newton
+        l = t10
+        change = newton
+    last = np.where(0.9999999999999858 - s0*np.abs(l) > 0.0, change, l)
+    t11 = l*s0
+    below0 = 1.0 - t11
+    above0 = 1.0 + t11
+    pair0 = above0*below0
+    t12 = l*s1
+    above1 = 1.0 + t12
+    below1 = 1.0 - t12
+    pair1 = above1*below1
+    inverse = 1.0/(pair0*pair1)
+    inverse0 = inverse*pair1
     r0 = below0*inverse0
     r1 = above0*inverse0
-    t15 = l*s1
-    below1 = 1.0 - t15
-    above1 = 1.0 + t15
-    inverse1 = 1.0/(above1*below1)
+    inverse1 = inverse*pair0
     r2 = below1*inverse1
     r3 = above1*inverse1
     multiplier[...] = l
-    last_change[...] = change
+    last_change[...] = last
+    d[...] = l*np.sqrt(hh0*r0*r0 + hh1*r1*r1 + hh2*r2*r2 + hh3*r3*r3)
+
+
+def foot_point_more(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
+    # Formula: multiplier l of the foot point by 8 passes of Newton from the Sampson correction,
+    # its last change, and the signed distance d = l |n|.
+    # Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
+    # f () shared, q1 (2,), q2 (2,)
+    # Outputs: multiplier (), last_change (), d ()
+    # Operations: 500, temporaries: 53.
+    R1_00 = R1[0, 0]
+    R1_01 = R1[0, 1]
+    R1_10 = R1[1, 0]
+    R1_11 = R1[1, 1]
+    R2_00 = R2[0, 0]
+    R2_01 = R2[0, 1]
+    R2_10 = R2[1, 0]
+    R2_11 = R2[1, 1]
+    s0 = s[0]
+    s1 = s[1]
+    b1_0 = b1[0]
+    b1_1 = b1[1]
+    b2_0 = b2[0]
+    b2_1 = b2[1]
+    q1_0 = q1[0]
+    q1_1 = q1[1]
+    q2_0 = q2[0]
+    q2_1 = q2[1]
+    a1_0 = R1_00*q1_0 + R1_10*q1_1
+    a1_1 = R1_01*q1_0 + R1_11*q1_1
+    a2_0 = R2_00*q2_0 + R2_10*q2_1
+    a2_1 = R2_01*q2_0 + R2_11*q2_1
+    t0 = b1_0 + a2_0*s0
+    t1 = b1_1 + a2_1*s1
+    C0 = f + a1_0*t0 + a1_1*t1 + a2_0*b2_0 + a2_1*b2_1
+    t2 = b2_0 + a1_0*s0
+    t4 = t0 + t2
+    hh0 = 0.5*t4*t4
+    t5 = b1_0 + a2_0*s0 - t2
+    hh1 = 0.5*t5*t5
+    t3 = b2_1 + a1_1*s1
+    t6 = t1 + t3
+    hh2 = 0.5*t6*t6
+    t7 = b1_1 + a2_1*s1 - t3
+    hh3 = 0.5*t7*t7
+    start = C0/(1e-300 + hh0 + hh1 + hh2 + hh3)
+    l = start
+    change = 0.0
+    for _ in range(8):
+        t8 = l*s0
+        below0 = 1.0 - t8
+        above0 = 1.0 + t8
+        pair0 = above0*below0
+        t9 = l*s1
+        above1 = 1.0 + t9
+        below1 = 1.0 - t9
+        pair1 = above1*below1
+        inverse = 1.0/(pair0*pair1)
+        inverse0 = inverse*pair1
+        r0 = below0*inverse0
+        r1 = above0*inverse0
+        inverse1 = inverse*pair0
+        r2 = below1*inverse1
+        r3 = above1*inverse1
+        newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3)
+        t10 = l + newton
+        l = t10
+        change = newton
+    last = np.where(0.9999999999999858 - s0*np.abs(l) > 0.0, change, l)
+    t11 = l*s0
+    below0 = 1.0 - t11
+    above0 = 1.0 + t11
+    pair0 = above0*below0
+    t12 = l*s1
+    above1 = 1.0 + t12
+    below1 = 1.0 - t12
+    pair1 = above1*below1
+    inverse = 1.0/(pair0*pair1)
+    inverse0 = inverse*pair1
+    r0 = below0*inverse0
+    r1 = above0*inverse0
+    inverse1 = inverse*pair0
+    r2 = below1*inverse1
+    r3 = above1*inverse1
+    multiplier[...] = l
+    last_change[...] = last
     d[...] = l*np.sqrt(hh0*r0*r0 + hh1*r1*r1 + hh2*r2*r2 + hh3*r3*r3)
 
 
@@ -148,7 +229,7 @@ def foot_point_safe(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
     # Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
     # f () shared, q1 (2,), q2 (2,)
     # Outputs: multiplier (), last_change (), d ()
-    # Operations: 6488, temporaries: 56.
+    # Operations: 6290, temporaries: 60.
     R1_00 = R1[0, 0]
     R1_01 = R1[0, 1]
     R1_10 = R1[1, 0]
@@ -194,38 +275,42 @@ def foot_point_safe(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
         t8 = l*s0
         below0 = 1.0 - t8
         above0 = 1.0 + t8
-        inverse0 = 1.0/(above0*below0)
+        pair0 = above0*below0
+        t9 = l*s1
+        above1 = 1.0 + t9
+        below1 = 1.0 - t9
+        pair1 = above1*below1
+        inverse = 1.0/(pair0*pair1)
+        inverse0 = inverse*pair1
         r0 = below0*inverse0
         r1 = above0*inverse0
-        t9 = l*s1
-        below1 = 1.0 - t9
-        above1 = 1.0 + t9
-        inverse1 = 1.0/(above1*below1)
+        inverse1 = inverse*pair0
         r2 = below1*inverse1
         r3 = above1*inverse1
-        t10 = 0.5*t8
-        t11 = 0.5*t9
-        value = C0 - hh0*l*r0*r0*(1.0 + t10) - hh1*l*r1*r1*(1.0 - t10) - hh2*l*r2*r2*(1.0 + t11) - hh3*l*r3*r3*(1.0 - t11)
+        value = C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3)
         high_new = np.where(value > 0.0, high, l)
         low_new = np.where(value > 0.0, l, low)
         step = value/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3)
-        t12 = l + step
-        moved = np.where((high_new - t12)*(low_new - t12) > 0.0, 0.5*high_new + 0.5*low_new, t12)
-        t13 = moved - l
+        t10 = l + step
+        moved = np.where((high_new - t10)*(low_new - t10) > 0.0, 0.5*high_new + 0.5*low_new, t10)
+        t11 = moved - l
         l = moved
         low = low_new
         high = high_new
-        change = t13
-    t14 = l*s0
-    below0 = 1.0 - t14
-    above0 = 1.0 + t14
-    inverse0 = 1.0/(above0*below0)
+        change = t11
+    t12 = l*s0
+    below0 = 1.0 - t12
+    above0 = 1.0 + t12
+    pair0 = above0*below0
+    t13 = l*s1
+    above1 = 1.0 + t13
+    below1 = 1.0 - t13
+    pair1 = above1*below1
+    inverse = 1.0/(pair0*pair1)
+    inverse0 = inverse*pair1
     r0 = below0*inverse0
     r1 = above0*inverse0
-    t15 = l*s1
-    below1 = 1.0 - t15
-    above1 = 1.0 + t15
-    inverse1 = 1.0/(above1*below1)
+    inverse1 = inverse*pair0
     r2 = below1*inverse1
     r3 = above1*inverse1
     multiplier[...] = l
@@ -239,7 +324,7 @@ def foot_point_derivative(R1, R2, s, b1, b2, f, q1, q2, l, q1_hat, q2_hat, dd_dF
     # Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
     # f () shared, q1 (2,), q2 (2,), l ()
     # Outputs: q1_hat (2,), q2_hat (2,), dd_dF (9,)
-    # Operations: 101, temporaries: 40.
+    # Operations: 103, temporaries: 43.
     R1_00 = R1[0, 0]
     R1_01 = R1[0, 1]
     R1_10 = R1[1, 0]
@@ -262,8 +347,14 @@ def foot_point_derivative(R1, R2, s, b1, b2, f, q1, q2, l, q1_hat, q2_hat, dd_dF
     a2_1 = R2_01*q2_0 + R2_11*q2_1
     t1 = l*s1
     below1 = 1.0 - t1
+    t0 = l*s0
+    above0 = 1.0 + t0
+    below0 = 1.0 - t0
+    pair0 = above0*below0
     above1 = 1.0 + t1
-    inverse1 = 1.0/(above1*below1)
+    pair1 = above1*below1
+    inverse = 1.0/(pair0*pair1)
+    inverse1 = inverse*pair0
     r2 = below1*inverse1
     t3 = 0.5*np.sqrt(2.0)
     t9 = b2_1 + a1_1*s1
@@ -275,10 +366,7 @@ def foot_point_derivative(R1, R2, s, b1, b2, f, q1, q2, l, q1_hat, q2_hat, dd_dF
     t13 = a1_1 - t12*t7
     a1_0 = R1_00*q1_0 + R1_10*q1_1
     a2_0 = R2_00*q2_0 + R2_10*q2_1
-    t0 = l*s0
-    below0 = 1.0 - t0
-    above0 = 1.0 + t0
-    inverse0 = 1.0/(above0*below0)
+    inverse0 = inverse*pair1
     r0 = below0*inverse0
     t2 = b2_0 + a1_0*s0
     t4 = r0*t3*(b1_0 + t2 + a2_0*s0)
@@ -314,12 +402,11 @@ def foot_point_derivative(R1, R2, s, b1, b2, f, q1, q2, l, q1_hat, q2_hat, dd_dF
 
 
 def foot_point_each(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
-    # Formula: multiplier l of the foot point by 2 passes of bracketed Newton from the Sampson
-    # correction, its last change, and the signed distance d = l |n|; each match with its own
-    # frame.
+    # Formula: multiplier l of the foot point by 2 passes of Newton from the Sampson correction,
+    # its last change, and the signed distance d = l |n|; each match with its own frame.
     # Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,)
     # Outputs: multiplier (), last_change (), d ()
-    # Operations: 216, temporaries: 56.
+    # Operations: 188, temporaries: 53.
     R1_00 = R1[0, 0]
     R1_01 = R1[0, 1]
     R1_10 = R1[1, 0]
@@ -338,7 +425,6 @@ def foot_point_each(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
     q1_1 = q1[1]
     q2_0 = q2[0]
     q2_1 = q2[1]
-    pole = 0.9999999999999858/(1e-140 + s0)
     a1_0 = R1_00*q1_0 + R1_10*q1_1
     a1_1 = R1_01*q1_0 + R1_11*q1_1
     a2_0 = R2_00*q2_0 + R2_10*q2_1
@@ -357,50 +443,131 @@ def foot_point_each(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
     t7 = b1_1 + a2_1*s1 - t3
     hh3 = 0.5*t7*t7
     start = C0/(1e-300 + hh0 + hh1 + hh2 + hh3)
-    l = np.where((-pole - start)*(pole - start) > 0.0, 0.0, start)
-    low = np.where(C0 > 0.0, 0.0, -pole)
-    high = np.where(C0 > 0.0, pole, 0.0)
+    l = start
     change = 0.0
     for _ in range(2):
         t8 = l*s0
         below0 = 1.0 - t8
         above0 = 1.0 + t8
-        inverse0 = 1.0/(above0*below0)
+        pair0 = above0*below0
+        t9 = l*s1
+        above1 = 1.0 + t9
+        below1 = 1.0 - t9
+        pair1 = above1*below1
+        inverse = 1.0/(pair0*pair1)
+        inverse0 = inverse*pair1
         r0 = below0*inverse0
         r1 = above0*inverse0
-        t9 = l*s1
-        below1 = 1.0 - t9
-        above1 = 1.0 + t9
-        inverse1 = 1.0/(above1*below1)
+        inverse1 = inverse*pair0
         r2 = below1*inverse1
         r3 = above1*inverse1
-        t10 = 0.5*t8
-        t11 = 0.5*t9
-        value = C0 - hh0*l*r0*r0*(1.0 + t10) - hh1*l*r1*r1*(1.0 - t10) - hh2*l*r2*r2*(1.0 + t11) - hh3*l*r3*r3*(1.0 - t11)
-        high_new = np.where(value > 0.0, high, l)
-        low_new = np.where(value > 0.0, l, low)
-        step = value/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3)
-        t12 = l + step
-        moved = np.where((high_new - t12)*(low_new - t12) > 0.0, 0.5*high_new + 0.5*low_new, t12)
-        t13 = moved - l
-        l = moved
-        low = low_new
-        high = high_new
-        change = t13
-    t14 = l*s0
-    below0 = 1.0 - t14
-    above0 = 1.0 + t14
-    inverse0 = 1.0/(above0*below0)
+        newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3)
+        t10 = l + newton
+        l = t10
+        change = newton
+    last = np.where(0.9999999999999858 - s0*np.abs(l) > 0.0, change, l)
+    t11 = l*s0
+    below0 = 1.0 - t11
+    above0 = 1.0 + t11
+    pair0 = above0*below0
+    t12 = l*s1
+    above1 = 1.0 + t12
+    below1 = 1.0 - t12
+    pair1 = above1*below1
+    inverse = 1.0/(pair0*pair1)
+    inverse0 = inverse*pair1
     r0 = below0*inverse0
     r1 = above0*inverse0
-    t15 = l*s1
-    below1 = 1.0 - t15
-    above1 = 1.0 + t15
-    inverse1 = 1.0/(above1*below1)
+    inverse1 = inverse*pair0
     r2 = below1*inverse1
     r3 = above1*inverse1
     multiplier[...] = l
-    last_change[...] = change
+    last_change[...] = last
+    d[...] = l*np.sqrt(hh0*r0*r0 + hh1*r1*r1 + hh2*r2*r2 + hh3*r3*r3)
+
+
+def foot_point_more_each(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
+    # Formula: multiplier l of the foot point by 8 passes of Newton from the Sampson correction,
+    # its last change, and the signed distance d = l |n|; each match with its own frame.
+    # Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,)
+    # Outputs: multiplier (), last_change (), d ()
+    # Operations: 500, temporaries: 53.
+    R1_00 = R1[0, 0]
+    R1_01 = R1[0, 1]
+    R1_10 = R1[1, 0]
+    R1_11 = R1[1, 1]
+    R2_00 = R2[0, 0]
+    R2_01 = R2[0, 1]
+    R2_10 = R2[1, 0]
+    R2_11 = R2[1, 1]
+    s0 = s[0]
+    s1 = s[1]
+    b1_0 = b1[0]
+    b1_1 = b1[1]
+    b2_0 = b2[0]
+    b2_1 = b2[1]
+    q1_0 = q1[0]
+    q1_1 = q1[1]
+    q2_0 = q2[0]
+    q2_1 = q2[1]
+    a1_0 = R1_00*q1_0 + R1_10*q1_1
+    a1_1 = R1_01*q1_0 + R1_11*q1_1
+    a2_0 = R2_00*q2_0 + R2_10*q2_1
+    a2_1 = R2_01*q2_0 + R2_11*q2_1
+    t0 = b1_0 + a2_0*s0
+    t1 = b1_1 + a2_1*s1
+    C0 = f + a1_0*t0 + a1_1*t1 + a2_0*b2_0 + a2_1*b2_1
+    t2 = b2_0 + a1_0*s0
+    t4 = t0 + t2
+    hh0 = 0.5*t4*t4
+    t5 = b1_0 + a2_0*s0 - t2
+    hh1 = 0.5*t5*t5
+    t3 = b2_1 + a1_1*s1
+    t6 = t1 + t3
+    hh2 = 0.5*t6*t6
+    t7 = b1_1 + a2_1*s1 - t3
+    hh3 = 0.5*t7*t7
+    start = C0/(1e-300 + hh0 + hh1 + hh2 + hh3)
+    l = start
+    change = 0.0
+    for _ in range(8):
+        t8 = l*s0
+        below0 = 1.0 - t8
+        above0 = 1.0 + t8
+        pair0 = above0*below0
+        t9 = l*s1
+        above1 = 1.0 + t9
+        below1 = 1.0 - t9
+        pair1 = above1*below1
+        inverse = 1.0/(pair0*pair1)
+        inverse0 = inverse*pair1
+        r0 = below0*inverse0
+        r1 = above0*inverse0
+        inverse1 = inverse*pair0
+        r2 = below1*inverse1
+        r3 = above1*inverse1
+        newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3)
+        t10 = l + newton
+        l = t10
+        change = newton
+    last = np.where(0.9999999999999858 - s0*np.abs(l) > 0.0, change, l)
+    t11 = l*s0
+    below0 = 1.0 - t11
+    above0 = 1.0 + t11
+    pair0 = above0*below0
+    t12 = l*s1
+    above1 = 1.0 + t12
+    below1 = 1.0 - t12
+    pair1 = above1*below1
+    inverse = 1.0/(pair0*pair1)
+    inverse0 = inverse*pair1
+    r0 = below0*inverse0
+    r1 = above0*inverse0
+    inverse1 = inverse*pair0
+    r2 = below1*inverse1
+    r3 = above1*inverse1
+    multiplier[...] = l
+    last_change[...] = last
     d[...] = l*np.sqrt(hh0*r0*r0 + hh1*r1*r1 + hh2*r2*r2 + hh3*r3*r3)
 
 
@@ -410,7 +577,7 @@ def foot_point_safe_each(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, 
     # frame.
     # Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,)
     # Outputs: multiplier (), last_change (), d ()
-    # Operations: 6488, temporaries: 56.
+    # Operations: 6290, temporaries: 60.
     R1_00 = R1[0, 0]
     R1_01 = R1[0, 1]
     R1_10 = R1[1, 0]
@@ -456,38 +623,42 @@ def foot_point_safe_each(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, 
         t8 = l*s0
         below0 = 1.0 - t8
         above0 = 1.0 + t8
-        inverse0 = 1.0/(above0*below0)
+        pair0 = above0*below0
+        t9 = l*s1
+        above1 = 1.0 + t9
+        below1 = 1.0 - t9
+        pair1 = above1*below1
+        inverse = 1.0/(pair0*pair1)
+        inverse0 = inverse*pair1
         r0 = below0*inverse0
         r1 = above0*inverse0
-        t9 = l*s1
-        below1 = 1.0 - t9
-        above1 = 1.0 + t9
-        inverse1 = 1.0/(above1*below1)
+        inverse1 = inverse*pair0
         r2 = below1*inverse1
         r3 = above1*inverse1
-        t10 = 0.5*t8
-        t11 = 0.5*t9
-        value = C0 - hh0*l*r0*r0*(1.0 + t10) - hh1*l*r1*r1*(1.0 - t10) - hh2*l*r2*r2*(1.0 + t11) - hh3*l*r3*r3*(1.0 - t11)
+        value = C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3)
         high_new = np.where(value > 0.0, high, l)
         low_new = np.where(value > 0.0, l, low)
         step = value/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3)
-        t12 = l + step
-        moved = np.where((high_new - t12)*(low_new - t12) > 0.0, 0.5*high_new + 0.5*low_new, t12)
-        t13 = moved - l
+        t10 = l + step
+        moved = np.where((high_new - t10)*(low_new - t10) > 0.0, 0.5*high_new + 0.5*low_new, t10)
+        t11 = moved - l
         l = moved
         low = low_new
         high = high_new
-        change = t13
-    t14 = l*s0
-    below0 = 1.0 - t14
-    above0 = 1.0 + t14
-    inverse0 = 1.0/(above0*below0)
+        change = t11
+    t12 = l*s0
+    below0 = 1.0 - t12
+    above0 = 1.0 + t12
+    pair0 = above0*below0
+    t13 = l*s1
+    above1 = 1.0 + t13
+    below1 = 1.0 - t13
+    pair1 = above1*below1
+    inverse = 1.0/(pair0*pair1)
+    inverse0 = inverse*pair1
     r0 = below0*inverse0
     r1 = above0*inverse0
-    t15 = l*s1
-    below1 = 1.0 - t15
-    above1 = 1.0 + t15
-    inverse1 = 1.0/(above1*below1)
+    inverse1 = inverse*pair0
     r2 = below1*inverse1
     r3 = above1*inverse1
     multiplier[...] = l
@@ -500,7 +671,7 @@ def foot_point_derivative_each(R1, R2, s, b1, b2, f, q1, q2, l, q1_hat, q2_hat, 
     # distance (envelope theorem); each match with its own frame.
     # Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,), l ()
     # Outputs: q1_hat (2,), q2_hat (2,), dd_dF (9,)
-    # Operations: 101, temporaries: 40.
+    # Operations: 103, temporaries: 43.
     R1_00 = R1[0, 0]
     R1_01 = R1[0, 1]
     R1_10 = R1[1, 0]
@@ -523,8 +694,14 @@ def foot_point_derivative_each(R1, R2, s, b1, b2, f, q1, q2, l, q1_hat, q2_hat, 
     a2_1 = R2_01*q2_0 + R2_11*q2_1
     t1 = l*s1
     below1 = 1.0 - t1
+    t0 = l*s0
+    above0 = 1.0 + t0
+    below0 = 1.0 - t0
+    pair0 = above0*below0
     above1 = 1.0 + t1
-    inverse1 = 1.0/(above1*below1)
+    pair1 = above1*below1
+    inverse = 1.0/(pair0*pair1)
+    inverse1 = inverse*pair0
     r2 = below1*inverse1
     t3 = 0.5*np.sqrt(2.0)
     t9 = b2_1 + a1_1*s1
@@ -536,10 +713,7 @@ def foot_point_derivative_each(R1, R2, s, b1, b2, f, q1, q2, l, q1_hat, q2_hat, 
     t13 = a1_1 - t12*t7
     a1_0 = R1_00*q1_0 + R1_10*q1_1
     a2_0 = R2_00*q2_0 + R2_10*q2_1
-    t0 = l*s0
-    below0 = 1.0 - t0
-    above0 = 1.0 + t0
-    inverse0 = 1.0/(above0*below0)
+    inverse0 = inverse*pair1
     r0 = below0*inverse0
     t2 = b2_0 + a1_0*s0
     t4 = r0*t3*(b1_0 + t2 + a2_0*s0)
@@ -580,7 +754,7 @@ def reprojection_gauss_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, g, N):
     # Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
     # f () shared, q1 (2,), q2 (2,), l (), weight ()
     # Outputs: g (9,) summed, N (45,) summed
-    # Operations: 126, temporaries: 60.
+    # Operations: 128, temporaries: 63.
     R1_00 = R1[0, 0]
     R1_01 = R1[0, 1]
     R1_10 = R1[1, 0]
@@ -605,7 +779,13 @@ def reprojection_gauss_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, g, N):
     t0 = l*s0
     below0 = 1.0 - t0
     above0 = 1.0 + t0
-    inverse0 = 1.0/(above0*below0)
+    pair0 = above0*below0
+    t1 = l*s1
+    above1 = 1.0 + t1
+    below1 = 1.0 - t1
+    pair1 = above1*below1
+    inverse = 1.0/(pair0*pair1)
+    inverse0 = inverse*pair1
     r0 = below0*inverse0
     t2 = b2_0 + a1_0*s0
     t4 = r0*t3*(b1_0 + t2 + a2_0*s0)
@@ -619,10 +799,7 @@ def reprojection_gauss_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, g, N):
     t14 = p2_0*t13
     a1_1 = R1_01*q1_0 + R1_11*q1_1
     a2_1 = R2_01*q2_0 + R2_11*q2_1
-    t1 = l*s1
-    below1 = 1.0 - t1
-    above1 = 1.0 + t1
-    inverse1 = 1.0/(above1*below1)
+    inverse1 = inverse*pair0
     r2 = below1*inverse1
     t7 = b2_1 + a1_1*s1
     t8 = r2*t3*(b1_1 + t7 + a2_1*s1)
@@ -715,13 +892,13 @@ def reprojection_gauss_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, g, N):
     N[44] = np.add.reduce(t17, axis=-1)
 
 
-def reprojection_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, curvature, g, H):
-    # Formula: gradient and exact Hessian (upper triangle) of a robust sum of d^2 / 2 by vect(F)
-    # of the rotated images, from H = l C_FF - R^T K^-1 R for each match.
+def reprojection_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, curvature, g, N, H):
+    # Formula: gradient, Gauss-Newton matrix and exact Hessian (upper triangles) of a robust sum
+    # of d^2 / 2 by vect(F) of the rotated images, H = l C_FF - R^T K^-1 R for each match.
     # Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
     # f () shared, q1 (2,), q2 (2,), l (), weight (), curvature ()
-    # Outputs: g (9,) summed, H (45,) summed
-    # Operations: 396, temporaries: 119.
+    # Outputs: g (9,) summed, N (45,) summed, H (45,) summed
+    # Operations: 442, temporaries: 143.
     R1_00 = R1[0, 0]
     R1_01 = R1[0, 1]
     R1_10 = R1[1, 0]
@@ -749,7 +926,15 @@ def reprojection_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, curvature, g, H
     below0 = -t2
     t1 = 1.0 + t0
     above0 = t1
-    inverse0 = 1.0/(above0*below0)
+    pair0 = above0*below0
+    t3 = l*s1
+    t4 = 1.0 + t3
+    above1 = t4
+    t5 = t3 - 1.0
+    below1 = -t5
+    pair1 = above1*below1
+    inverse = 1.0/(pair0*pair1)
+    inverse0 = inverse*pair1
     r0 = below0*inverse0
     t6 = b2_0 + a1_0*s0
     t8 = r0*t7*(b1_0 + t6 + a2_0*s0)
@@ -762,12 +947,7 @@ def reprojection_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, curvature, g, H
     t18 = p1_0*p2_0
     a1_1 = R1_01*q1_0 + R1_11*q1_1
     a2_1 = R2_01*q2_0 + R2_11*q2_1
-    t3 = l*s1
-    t5 = t3 - 1.0
-    below1 = -t5
-    t4 = 1.0 + t3
-    above1 = t4
-    inverse1 = 1.0/(above1*below1)
+    inverse1 = inverse*pair0
     r2 = below1*inverse1
     t11 = b2_1 + a1_1*s1
     t12 = r2*t7*(b1_1 + t11 + a2_1*s1)
@@ -782,83 +962,104 @@ def reprojection_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, curvature, g, H
     t21 = p1_1*p2_1
     t22 = p1_0*p1_0
     t23 = p2_0*p2_0
-    t24 = l*l
-    t25 = curvature*t24
-    t26 = t23*t25
-    t27 = 1.0/(t1*t2)
-    t28 = t24*t27
-    t29 = p1_0*t28
-    t30 = l*l*l
-    t31 = s0*t27*t30
-    t32 = p2_0*t31
-    t33 = t32 - t29
-    t34 = p2_0*t28
-    t35 = p1_0*t31
-    t36 = t35 - t34
-    n2 = t15
-    t37 = n2*t27
     n0 = t10
-    t38 = n0*t27
-    t39 = t0*t38 - t37
-    t40 = l*t39
-    t41 = t0*t37 - t38
-    t42 = l*t41
-    t43 = p1_0*p2_0 - p1_0*t40 - p2_0*t42
     n1 = t14
+    n2 = t15
     n3 = t16
-    t44 = 1.0/(t4*t5)
-    t45 = n1*t44
-    t46 = n3*t44
-    t47 = t3*t46 - t45
-    t48 = t3*t45 - t46
-    t49 = 1.0/(n0*t41 + n1*t47 + n2*t39 + n3*t48)
-    t50 = p1_0*t26
-    t51 = l*t47
-    t52 = p1_1*p2_0 - p1_1*t40 - p2_0*t51
-    t53 = p2_0 - t40
-    t54 = t43*t49
-    t55 = p2_0*t25
-    t56 = t22*t55
-    t57 = l*t48
-    t58 = p1_0*p2_1 - p1_0*t57 - p2_1*t42
-    t59 = t18*t25
-    t60 = t21*t59
-    t61 = p1_1*p2_1 - p1_1*t57 - p2_1*t51
-    t62 = t49*weight
-    t63 = t43*t62
-    t64 = p2_1*t25
-    t65 = t18*t64
-    t66 = p2_1 - t57
-    t67 = p1_0 - t42
-    t68 = p1_1*t25
-    t69 = t18*t68
-    t70 = p1_1 - t51
-    t71 = p1_1*p1_1
-    t72 = t24*t44
-    t73 = t49*t52
-    t74 = s1*t30*t44
-    t75 = t55*t71
-    t76 = p2_0*t72
-    t77 = t19*t64
-    t78 = t19*t25
-    t79 = t53*t62
-    t80 = p2_1*p2_1
-    t81 = t25*t80
-    t82 = p1_0*t81
-    t83 = p1_0*t72
-    t84 = t49*t58
-    t85 = t20*t68
-    t86 = t20*t25
-    t87 = p1_1*t72
-    t88 = p2_1*t74
-    t89 = p2_1*t72
-    t90 = p1_1*t74
-    t91 = t49*t61
-    t92 = t61*t62
-    t93 = t21*t25
-    t94 = t62*t66
-    t95 = p1_0*t25
-    t96 = t62*t67
+    length2 = 1e-300 + n0*n0 + n1*n1 + n2*n2 + n3*n3
+    t24 = weight/length2
+    t25 = t23*t24
+    t26 = p1_0*t25
+    t27 = p2_0*t24
+    t28 = t22*t27
+    t29 = t18*t24
+    t30 = t21*t29
+    t31 = p2_1*t24
+    t32 = t18*t31
+    t33 = p1_1*t24
+    t34 = t18*t33
+    t35 = p1_1*p1_1
+    t36 = t27*t35
+    t37 = t19*t31
+    t38 = t19*t24
+    t39 = p2_1*p2_1
+    t40 = t24*t39
+    t41 = p1_0*t40
+    t42 = t20*t33
+    t43 = t20*t24
+    t44 = t21*t24
+    t45 = p1_0*t24
+    t46 = l*l
+    t47 = curvature*t46
+    t48 = t23*t47
+    t49 = 1.0/(t1*t2)
+    t50 = t46*t49
+    t51 = p1_0*t50
+    t52 = l*l*l
+    t53 = s0*t49*t52
+    t54 = p2_0*t53
+    t55 = t54 - t51
+    t56 = p2_0*t50
+    t57 = p1_0*t53
+    t58 = t57 - t56
+    t59 = n2*t49
+    t60 = n0*t49
+    t61 = t0*t60 - t59
+    t62 = l*t61
+    t63 = t0*t59 - t60
+    t64 = l*t63
+    t65 = p1_0*p2_0 - p1_0*t62 - p2_0*t64
+    t66 = 1.0/(t4*t5)
+    t67 = n1*t66
+    t68 = n3*t66
+    t69 = t3*t68 - t67
+    t70 = t3*t67 - t68
+    t71 = 1.0/(n0*t63 + n1*t69 + n2*t61 + n3*t70)
+    t72 = p1_0*t48
+    t73 = l*t69
+    t74 = p1_1*p2_0 - p1_1*t62 - p2_0*t73
+    t75 = p2_0 - t62
+    t76 = t65*t71
+    t77 = p2_0*t47
+    t78 = t22*t77
+    t79 = l*t70
+    t80 = p1_0*p2_1 - p1_0*t79 - p2_1*t64
+    t81 = t18*t47
+    t82 = t21*t81
+    t83 = p1_1*p2_1 - p1_1*t79 - p2_1*t73
+    t84 = t71*weight
+    t85 = t65*t84
+    t86 = p2_1*t47
+    t87 = t18*t86
+    t88 = p2_1 - t79
+    t89 = p1_0 - t64
+    t90 = p1_1*t47
+    t91 = t18*t90
+    t92 = p1_1 - t73
+    t93 = t46*t66
+    t94 = t71*t74
+    t95 = s1*t52*t66
+    t96 = t35*t77
+    t97 = p2_0*t93
+    t98 = t19*t86
+    t99 = t19*t47
+    t100 = t75*t84
+    t101 = t39*t47
+    t102 = p1_0*t101
+    t103 = p1_0*t93
+    t104 = t71*t80
+    t105 = t20*t90
+    t106 = t20*t47
+    t107 = p1_1*t93
+    t108 = p2_1*t95
+    t109 = p2_1*t93
+    t110 = p1_1*t95
+    t111 = t71*t83
+    t112 = t83*t84
+    t113 = t21*t47
+    t114 = t84*t88
+    t115 = p1_0*t47
+    t116 = t84*t89
     g[0] = np.add.reduce(t17*t18, axis=-1)
     g[1] = np.add.reduce(t17*t19, axis=-1)
     g[2] = np.add.reduce(p2_0*t17, axis=-1)
@@ -868,48 +1069,93 @@ def reprojection_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, curvature, g, H
     g[6] = np.add.reduce(p1_0*t17, axis=-1)
     g[7] = np.add.reduce(p1_1*t17, axis=-1)
     g[8] = np.add.reduce(t17, axis=-1)
-    H[0] = np.add.reduce(t22*t26 + weight*(t43*t43*t49 - p1_0*t33 - p2_0*t36), axis=-1)
-    H[1] = np.add.reduce(p1_1*t50 + weight*(t43*t49*t52 - p1_1*t33), axis=-1)
-    H[2] = np.add.reduce(t50 + weight*(t29 + t53*t54 - t32), axis=-1)
-    H[3] = np.add.reduce(p2_1*t56 + weight*(t43*t49*t58 - p2_1*t36), axis=-1)
-    H[4] = np.add.reduce(t60 + t61*t63, axis=-1)
-    H[5] = np.add.reduce(t65 + t63*t66, axis=-1)
-    H[6] = np.add.reduce(t56 + weight*(t34 + t54*t67 - t35), axis=-1)
-    H[7] = np.add.reduce(t69 + t63*t70, axis=-1)
-    H[8] = np.add.reduce(t59 + t63, axis=-1)
-    H[9] = np.add.reduce(t26*t71 + weight*(t23*t72 + t28*t71 + t49*t52*t52), axis=-1)
-    H[10] = np.add.reduce(p1_1*t26 + weight*(p1_1*t28 + t53*t73), axis=-1)
-    H[11] = np.add.reduce(t60 + weight*(t49*t52*t58 - t18*t74 - t21*t31), axis=-1)
-    H[12] = np.add.reduce(p2_1*t75 + weight*(p2_1*t76 + t61*t73 - t19*t74), axis=-1)
-    H[13] = np.add.reduce(t77 + weight*(t49*t52*t66 - p2_0*t74), axis=-1)
-    H[14] = np.add.reduce(t69 + weight*(t49*t52*t67 - p1_1*t31), axis=-1)
-    H[15] = np.add.reduce(t75 + weight*(t76 + t70*t73), axis=-1)
-    H[16] = np.add.reduce(t78 + t52*t62, axis=-1)
-    H[17] = np.add.reduce(t26 + weight*(t28 + t49*t53*t53), axis=-1)
-    H[18] = np.add.reduce(t65 + weight*(t49*t53*t58 - p2_1*t31), axis=-1)
-    H[19] = np.add.reduce(t77 + t61*t79, axis=-1)
-    H[20] = np.add.reduce(p2_1*t55 + t66*t79, axis=-1)
-    H[21] = np.add.reduce(t59 + weight*(t49*t53*t67 - t31), axis=-1)
-    H[22] = np.add.reduce(t78 + t70*t79, axis=-1)
-    H[23] = np.add.reduce(t55 + t79, axis=-1)
-    H[24] = np.add.reduce(t22*t81 + weight*(t22*t72 + t28*t80 + t49*t58*t58), axis=-1)
-    H[25] = np.add.reduce(p1_1*t82 + weight*(p1_1*t83 + t61*t84 - t20*t74), axis=-1)
-    H[26] = np.add.reduce(t82 + weight*(t83 + t66*t84), axis=-1)
-    H[27] = np.add.reduce(t22*t64 + weight*(p2_1*t28 + t67*t84), axis=-1)
-    H[28] = np.add.reduce(t85 + weight*(t49*t58*t70 - p1_0*t74), axis=-1)
-    H[29] = np.add.reduce(t86 + t58*t62, axis=-1)
-    H[30] = np.add.reduce(t71*t81 + weight*(t49*t61*t61 - p1_1*(t88 - t87) - p2_1*(t90 - t89)), axis=-1)
-    H[31] = np.add.reduce(p1_1*t81 + weight*(t87 + t66*t91 - t88), axis=-1)
-    H[32] = np.add.reduce(t85 + t67*t92, axis=-1)
-    H[33] = np.add.reduce(t64*t71 + weight*(t89 + t70*t91 - t90), axis=-1)
-    H[34] = np.add.reduce(t92 + t93, axis=-1)
-    H[35] = np.add.reduce(t81 + weight*(t72 + t49*t66*t66), axis=-1)
-    H[36] = np.add.reduce(t86 + t67*t94, axis=-1)
-    H[37] = np.add.reduce(t93 + weight*(t49*t66*t70 - t74), axis=-1)
-    H[38] = np.add.reduce(t64 + t94, axis=-1)
-    H[39] = np.add.reduce(t22*t25 + weight*(t28 + t49*t67*t67), axis=-1)
-    H[40] = np.add.reduce(p1_1*t95 + t70*t96, axis=-1)
-    H[41] = np.add.reduce(t95 + t96, axis=-1)
-    H[42] = np.add.reduce(t25*t71 + weight*(t72 + t49*t70*t70), axis=-1)
-    H[43] = np.add.reduce(t68 + t62*t70, axis=-1)
-    H[44] = np.add.reduce(t25 + t62, axis=-1)
+    N[0] = np.add.reduce(t22*t25, axis=-1)
+    N[1] = np.add.reduce(p1_1*t26, axis=-1)
+    N[2] = np.add.reduce(t26, axis=-1)
+    N[3] = np.add.reduce(p2_1*t28, axis=-1)
+    N[4] = np.add.reduce(t30, axis=-1)
+    N[5] = np.add.reduce(t32, axis=-1)
+    N[6] = np.add.reduce(t28, axis=-1)
+    N[7] = np.add.reduce(t34, axis=-1)
+    N[8] = np.add.reduce(t29, axis=-1)
+    N[9] = np.add.reduce(t25*t35, axis=-1)
+    N[10] = np.add.reduce(p1_1*t25, axis=-1)
+    N[11] = np.add.reduce(t30, axis=-1)
+    N[12] = np.add.reduce(p2_1*t36, axis=-1)
+    N[13] = np.add.reduce(t37, axis=-1)
+    N[14] = np.add.reduce(t34, axis=-1)
+    N[15] = np.add.reduce(t36, axis=-1)
+    N[16] = np.add.reduce(t38, axis=-1)
+    N[17] = np.add.reduce(t25, axis=-1)
+    N[18] = np.add.reduce(t32, axis=-1)
+    N[19] = np.add.reduce(t37, axis=-1)
+    N[20] = np.add.reduce(p2_1*t27, axis=-1)
+    N[21] = np.add.reduce(t29, axis=-1)
+    N[22] = np.add.reduce(t38, axis=-1)
+    N[23] = np.add.reduce(t27, axis=-1)
+    N[24] = np.add.reduce(t22*t40, axis=-1)
+    N[25] = np.add.reduce(p1_1*t41, axis=-1)
+    N[26] = np.add.reduce(t41, axis=-1)
+    N[27] = np.add.reduce(t22*t31, axis=-1)
+    N[28] = np.add.reduce(t42, axis=-1)
+    N[29] = np.add.reduce(t43, axis=-1)
+    N[30] = np.add.reduce(t35*t40, axis=-1)
+    N[31] = np.add.reduce(p1_1*t40, axis=-1)
+    N[32] = np.add.reduce(t42, axis=-1)
+    N[33] = np.add.reduce(t31*t35, axis=-1)
+    N[34] = np.add.reduce(t44, axis=-1)
+    N[35] = np.add.reduce(t40, axis=-1)
+    N[36] = np.add.reduce(t43, axis=-1)
+    N[37] = np.add.reduce(t44, axis=-1)
+    N[38] = np.add.reduce(t31, axis=-1)
+    N[39] = np.add.reduce(t22*t24, axis=-1)
+    N[40] = np.add.reduce(p1_1*t45, axis=-1)
+    N[41] = np.add.reduce(t45, axis=-1)
+    N[42] = np.add.reduce(t24*t35, axis=-1)
+    N[43] = np.add.reduce(t33, axis=-1)
+    N[44] = np.add.reduce(t24, axis=-1)
+    H[0] = np.add.reduce(t22*t48 + weight*(t65*t65*t71 - p1_0*t55 - p2_0*t58), axis=-1)
+    H[1] = np.add.reduce(p1_1*t72 + weight*(t65*t71*t74 - p1_1*t55), axis=-1)
+    H[2] = np.add.reduce(t72 + weight*(t51 + t75*t76 - t54), axis=-1)
+    H[3] = np.add.reduce(p2_1*t78 + weight*(t65*t71*t80 - p2_1*t58), axis=-1)
+    H[4] = np.add.reduce(t82 + t83*t85, axis=-1)
+    H[5] = np.add.reduce(t87 + t85*t88, axis=-1)
+    H[6] = np.add.reduce(t78 + weight*(t56 + t76*t89 - t57), axis=-1)
+    H[7] = np.add.reduce(t91 + t85*t92, axis=-1)
+    H[8] = np.add.reduce(t81 + t85, axis=-1)
+    H[9] = np.add.reduce(t35*t48 + weight*(t23*t93 + t35*t50 + t71*t74*t74), axis=-1)
+    H[10] = np.add.reduce(p1_1*t48 + weight*(p1_1*t50 + t75*t94), axis=-1)
+    H[11] = np.add.reduce(t82 + weight*(t71*t74*t80 - t18*t95 - t21*t53), axis=-1)
+    H[12] = np.add.reduce(p2_1*t96 + weight*(p2_1*t97 + t83*t94 - t19*t95), axis=-1)
+    H[13] = np.add.reduce(t98 + weight*(t71*t74*t88 - p2_0*t95), axis=-1)
+    H[14] = np.add.reduce(t91 + weight*(t71*t74*t89 - p1_1*t53), axis=-1)
+    H[15] = np.add.reduce(t96 + weight*(t97 + t92*t94), axis=-1)
+    H[16] = np.add.reduce(t99 + t74*t84, axis=-1)
+    H[17] = np.add.reduce(t48 + weight*(t50 + t71*t75*t75), axis=-1)
+    H[18] = np.add.reduce(t87 + weight*(t71*t75*t80 - p2_1*t53), axis=-1)
+    H[19] = np.add.reduce(t98 + t100*t83, axis=-1)
+    H[20] = np.add.reduce(p2_1*t77 + t100*t88, axis=-1)
+    H[21] = np.add.reduce(t81 + weight*(t71*t75*t89 - t53), axis=-1)
+    H[22] = np.add.reduce(t99 + t100*t92, axis=-1)
+    H[23] = np.add.reduce(t100 + t77, axis=-1)
+    H[24] = np.add.reduce(t101*t22 + weight*(t22*t93 + t39*t50 + t71*t80*t80), axis=-1)
+    H[25] = np.add.reduce(p1_1*t102 + weight*(p1_1*t103 + t104*t83 - t20*t95), axis=-1)
+    H[26] = np.add.reduce(t102 + weight*(t103 + t104*t88), axis=-1)
+    H[27] = np.add.reduce(t22*t86 + weight*(p2_1*t50 + t104*t89), axis=-1)
+    H[28] = np.add.reduce(t105 + weight*(t71*t80*t92 - p1_0*t95), axis=-1)
+    H[29] = np.add.reduce(t106 + t80*t84, axis=-1)
+    H[30] = np.add.reduce(t101*t35 + weight*(t71*t83*t83 - p1_1*(t108 - t107) - p2_1*(t110 - t109)), axis=-1)
+    H[31] = np.add.reduce(p1_1*t101 + weight*(t107 + t111*t88 - t108), axis=-1)
+    H[32] = np.add.reduce(t105 + t112*t89, axis=-1)
+    H[33] = np.add.reduce(t35*t86 + weight*(t109 + t111*t92 - t110), axis=-1)
+    H[34] = np.add.reduce(t112 + t113, axis=-1)
+    H[35] = np.add.reduce(t101 + weight*(t93 + t71*t88*t88), axis=-1)
+    H[36] = np.add.reduce(t106 + t114*t89, axis=-1)
+    H[37] = np.add.reduce(t113 + weight*(t71*t88*t92 - t95), axis=-1)
+    H[38] = np.add.reduce(t114 + t86, axis=-1)
+    H[39] = np.add.reduce(t22*t47 + weight*(t50 + t71*t89*t89), axis=-1)
+    H[40] = np.add.reduce(p1_1*t115 + t116*t92, axis=-1)
+    H[41] = np.add.reduce(t115 + t116, axis=-1)
+    H[42] = np.add.reduce(t35*t47 + weight*(t93 + t71*t92*t92), axis=-1)
+    H[43] = np.add.reduce(t90 + t84*t92, axis=-1)
+    H[44] = np.add.reduce(t47 + t84, axis=-1)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from epigauge import lm
 from epigauge._arguments import as_count, as_matches, as_weights
 from epigauge.errors import ArgumentError
-from epigauge.two_view.refine import refine_fundamental
+from epigauge.two_view import native
+from epigauge.two_view._partial import Partial
+from epigauge.two_view.express import completed
+from epigauge.two_view.refine import plan_of, refine_fundamental
 from epigauge.two_view.result import FundamentalResult
 
 __all__ = ["BATCH_STATUS", "FundamentalBatch", "refine_fundamental_batch"]
@@ -23,12 +27,15 @@ Array = NDArray[np.float64]
 #: Status of a pair that could not be refined, beside those of `epigauge.lm.STATUS`.
 REFUSED = -9
 
+#: Pairs that a thread refines at a time.
+_CHUNK = 64
+
 #: Meaning of `FundamentalBatch.status`.
 BATCH_STATUS = lm.STATUS | {REFUSED: "the matches of this pair cannot determine F: see `reasons`"}
 
 
 @dataclass(frozen=True)
-class FundamentalBatch:
+class FundamentalBatch(Partial):
     """Results of many pairs, one row a pair; fields as in `FundamentalResult`.
 
     Attributes
@@ -47,6 +54,9 @@ class FundamentalBatch:
         Signed distances of all matches, in the order they were given.
     reasons : dict of int to str
         Why a pair was refused, by its number.
+    flags : tuple of tuple of str
+        What each pair's matches do not support, as `FundamentalResult.flags`; empty for refused
+        pairs, and for all where they were not asked for.
     """
 
     F: Array
@@ -64,6 +74,7 @@ class FundamentalBatch:
     success: NDArray[np.bool_]
     distances: Array
     reasons: dict[int, str]
+    flags: tuple[tuple[str, ...], ...]
 
     def __len__(self) -> int:
         """Return the number of pairs."""
@@ -79,6 +90,7 @@ def refine_fundamental_batch(
     weights: ArrayLike | None = None,
     workers: int = 1,
     progress: Callable[[int, int], object] | None = None,
+    flags: bool = False,
     **options: Any,
 ) -> FundamentalBatch:
     """Refine the fundamental matrices of many pairs, each as by `refine_fundamental`.
@@ -97,6 +109,8 @@ def refine_fundamental_batch(
         Threads. The results do not depend on it.
     progress : callable, optional
         Called as ``progress(done, n)`` after every pair, from the calling thread.
+    flags : bool
+        Diagnose every pair too, which takes about as long as a refinement.
     **options
         All other options of `refine_fundamental`, the same for every pair.
 
@@ -115,33 +129,24 @@ def refine_fundamental_batch(
     x1, x2 = as_matches(x1, x2, at_least=0)
     bounds = _as_offsets(offsets, len(x1))
     count = len(bounds) - 1
-    w = None if weights is None else as_weights(weights, len(x1))
-    starts = None if F0 is None else np.asarray(F0, dtype=np.float64)
+    w = None if weights is None else np.ascontiguousarray(as_weights(weights, len(x1)))
+    starts = None if F0 is None else np.ascontiguousarray(F0, dtype=np.float64)
     if starts is not None and starts.shape != (count, 3, 3):
         raise ArgumentError("F0", f"has shape {starts.shape}", f"({count}, 3, 3)")
     _check_options(options)
-
-    def one(k: int) -> FundamentalResult | str:
-        rows = slice(bounds[k], bounds[k + 1])
-        try:
-            return refine_fundamental(
-                x1[rows],
-                x2[rows],
-                None if starts is None else starts[k],
-                weights=None if w is None else w[rows],
-                **options,
-            )
-        except ArgumentError as error:
-            return str(error)
-
-    results: list[FundamentalResult | str] = [""] * count
+    work = _Work(x1, x2, bounds, starts, w, options)
+    size = 1 if work.plan.native is None else _CHUNK
+    chunks = [range(first, min(first + size, count)) for first in range(0, count, size)]
+    done = 0
     with ThreadPoolExecutor(as_count("workers", workers)) as pool:
-        futures = {pool.submit(one, k): k for k in range(count)}
-        for done, future in enumerate(as_completed(futures), start=1):
-            results[futures[future]] = future.result()
-            if progress is not None:
-                progress(done, count)
-    return _gather(results, bounds)
+        futures = {pool.submit(work.refine, chunk): chunk for chunk in chunks}
+        for future in as_completed(futures):
+            future.result()
+            for _ in futures[future]:
+                done += 1
+                if progress is not None:
+                    progress(done, count)
+    return work.result(flags)
 
 
 def _as_offsets(offsets: ArrayLike, m: int) -> NDArray[np.intp]:
@@ -160,30 +165,143 @@ def _check_options(options: dict[str, Any]) -> None:
     refine_fundamental(grid, grid @ [[1.0, 0.2], [0.1, 1.1]] + grid**2, **options)
 
 
-def _gather(results: list[FundamentalResult | str], bounds: NDArray[np.intp]) -> FundamentalBatch:
-    """Return results as arrays, neutral rows for those refused."""
-    count = len(results)
-    batch = FundamentalBatch(
-        F=np.zeros((count, 3, 3)),
-        sigma=np.zeros(count),
-        cost=np.zeros(count),
-        rms_px=np.zeros(count),
-        noise_px=np.zeros(count),
-        condition=np.full(count, np.inf),
-        covariance=np.tile(np.diag(np.full(9, np.inf)), (count, 1, 1)),
-        rank=np.zeros(count, dtype=np.intp),
-        nfev=np.zeros(count, dtype=np.intp),
-        njev=np.zeros(count, dtype=np.intp),
-        nit=np.zeros(count, dtype=np.intp),
-        status=np.full(count, REFUSED, dtype=np.intp),
-        success=np.zeros(count, dtype=np.bool_),
-        distances=np.zeros(int(bounds[-1])),
-        reasons={k: result for k, result in enumerate(results) if isinstance(result, str)},
-    )
-    shared = set(FundamentalBatch.__dataclass_fields__) - {"distances", "reasons"}
-    for k, result in enumerate(results):
-        if not isinstance(result, str):
-            for name in shared:
-                getattr(batch, name)[k] = getattr(result, name)
-            batch.distances[bounds[k] : bounds[k + 1]] = result.fun
-    return batch
+class _Work:
+    """The pairs, how they are refined, and the tables their results go to."""
+
+    def __init__(
+        self,
+        x1: Array,
+        x2: Array,
+        bounds: NDArray[np.intp],
+        starts: Array | None,
+        weights: Array | None,
+        options: dict[str, Any],
+    ) -> None:
+        self.x1, self.x2, self.bounds = x1, x2, bounds
+        self.starts, self.weights = starts, weights
+        self.options, self.plan = options, plan_of(options)
+        count = len(bounds) - 1
+        self.known: dict[str, Any] = {
+            "F": np.zeros((count, 3, 3)),
+            **{name: np.zeros(count) for name in ("sigma", "cost", "rms_px")},
+            **{name: np.zeros(count, dtype=np.intp) for name in ("nfev", "njev", "nit")},
+            "status": np.full(count, REFUSED, dtype=np.intp),
+            "success": np.zeros(count, dtype=np.bool_),
+            "distances": np.zeros(len(x1)),
+        }
+        self.reasons: dict[int, str] = {}
+        #: Whole results of pairs refined one by one, and how to get those of the others.
+        self.results: dict[int, FundamentalResult] = {}
+        self.tables: dict[int, native.Pair] = {}
+
+    def refine(self, chunk: range) -> None:
+        """Refine some pairs: by the compiled loop, or one by one."""
+        rest: Iterable[int] = chunk
+        if self.plan.native is not None:
+            rest = self._compiled(chunk, self.plan.native)
+        for k in rest:
+            self._one(k)
+
+    def _compiled(self, chunk: range, options: native.PairOptions) -> list[int]:
+        """Refine what is plainly in order; return the others."""
+        first, last = chunk.start, chunk.stop
+        rows = self._rows(first, last)
+        pairs = native.refine_pairs(
+            self.x1[rows],
+            self.x2[rows],
+            self.bounds[first : last + 1] - self.bounds[first],
+            None if self.starts is None else self.starts[first:last],
+            None if self.weights is None else self.weights[rows],
+            options,
+        )
+        done = pairs.numbers[:, 0] == 0
+        own = slice(first, last)
+        for name, values in columns(pairs).items():
+            self.known[name][own][done] = values[done]
+        self.known["distances"][rows] = pairs.distances
+        self.tables[first] = pairs
+        return [first + int(i) for i in np.flatnonzero(~done)]
+
+    def _one(self, k: int) -> None:
+        rows = self._rows(k, k + 1)
+        self.known["distances"][rows] = 0.0
+        try:
+            result = refine_fundamental(
+                self.x1[rows],
+                self.x2[rows],
+                None if self.starts is None else self.starts[k],
+                weights=None if self.weights is None else self.weights[rows],
+                **self.options,
+            )
+        except ArgumentError as error:
+            self.reasons[k] = str(error)
+            return
+        self.results[k] = result
+        for name in self.known:
+            if name != "distances":
+                self.known[name][k] = getattr(result, name)
+        self.known["distances"][rows] = result.fun
+
+    def _rows(self, first: int, last: int) -> slice:
+        return slice(int(self.bounds[first]), int(self.bounds[last]))
+
+    def result(self, flags: bool) -> FundamentalBatch:
+        """Return the batch; what is costly is computed when it is asked for."""
+        known = self.known | {"reasons": dict(sorted(self.reasons.items()))}
+        # The caller may write into the arrays before the rest is computed.
+        self.x1, self.x2 = self.x1.copy(), self.x2.copy()
+        self.weights = None if self.weights is None else self.weights.copy()
+        count = len(known["F"])
+        diagnosed = (self._whole(k).flags if k not in self.reasons else () for k in range(count))
+        known["flags"] = tuple(diagnosed) if flags else ((),) * count
+        return FundamentalBatch.partial(known, self._rest)
+
+    def _rest(self) -> SimpleNamespace:
+        """Return what takes longer than the refinement, neutral for pairs that were refused."""
+        count = len(self.bounds) - 1
+        rest = SimpleNamespace(
+            noise_px=np.zeros(count),
+            condition=np.full(count, np.inf),
+            covariance=np.tile(np.diag(np.full(9, np.inf)), (count, 1, 1)),
+            rank=np.zeros(count, dtype=np.intp),
+        )
+        for k in range(count):
+            if k not in self.reasons:
+                whole = self._whole(k)
+                for name in rest.__dict__:
+                    getattr(rest, name)[k] = getattr(whole, name)
+        return rest
+
+    def _whole(self, k: int) -> FundamentalResult:
+        if k in self.results:
+            return self.results[k]
+        rows, first = self._rows(k, k + 1), k - k % _CHUNK
+        weights = None if self.weights is None else self.weights[rows]
+        plan = self.plan
+        return completed(
+            self.tables[first],
+            k - first,
+            self.x1[rows],
+            self.x2[rows],
+            weights,
+            plan.options,
+            plan.noise_px,
+        )
+
+
+def columns(pairs: native.Pair) -> dict[str, NDArray[Any]]:
+    """Return what the compiled loop tells of each pair, in pixels."""
+    _, nfev, njev, nit, status = pairs.numbers.T
+    table = pairs.table
+    with np.errstate(all="ignore"):  # rows of pairs that were left alone hold anything
+        return {
+            "F": table[:, :9].reshape(-1, 3, 3),
+            "sigma": table[:, 27],
+            "cost": table[:, 28] * table[:, 35] ** 2,
+            "rms_px": table[:, 35] * np.sqrt(table[:, 29] / (4.0 * table[:, 30])),
+            "nfev": nfev,
+            "njev": njev,
+            "nit": nit,
+            "status": status,
+            "success": status > 0,
+        }

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 #: A foot point is accepted when its last Newton change moved it by less than this (relative);
 #: convergence is quadratic, so that the error left is the square of it.
-_SETTLED = 1e-7
+_SETTLED = 1e-6
 
 #: Squared derivative of a distance by F (conditioned, of unit size) beyond which the match counts
 #: as lying on both epipoles, where the distance has no derivative; it is then left out of the step.
@@ -116,8 +116,9 @@ class Reprojection:
         bracketed down to rounding.
         """
         frame = self.kernels.bilinear_frame(F)
-        multiplier, change, d = self.kernels.foot_point(*frame, self.q1, self.q2)
-        unsettled = _unsettled(multiplier, change, d)
+        with np.errstate(all="ignore"):  # Newton may step onto a pole
+            multiplier, change, d = self.kernels.foot_point(*frame, self.q1, self.q2)
+            unsettled = _unsettled(multiplier, change, d)
         if unsettled.any():
             q1, q2 = self.q1[:, unsettled], self.q2[:, unsettled]
             safe = self.kernels.foot_point_safe(*frame, q1, q2)
@@ -142,18 +143,18 @@ class Reprojection:
         """Return gradient, J^T J and Hessian; summed in rotated images, turned back here."""
         assert isinstance(distances, FootPoints)
         matches = (self.q1, self.q2, distances.multiplier, weight)
-        g, packed = self.kernels.reprojection_gauss_newton(*distances.frame, *matches)
-        N = _unpack(packed)
+        if curvature is None:
+            g, packed = self.kernels.reprojection_gauss_newton(*distances.frame, *matches)
+            N = H = _unpack(packed)
+        else:
+            g, *both = self.kernels.reprojection_newton(*distances.frame, *matches, curvature)
+            N, H = map(_unpack, both)
         if not np.trace(N) < _SINGULAR and weight.any():
             rows = self.corrected(distances)[2]
             smooth = np.sum(rows**2, axis=0) < _SINGULAR
             if not smooth.all():
                 rest = None if curvature is None else curvature * smooth
                 return self.normal(F, distances, weight * smooth, rest)
-        H = N
-        if curvature is not None:
-            _, packed = self.kernels.reprojection_newton(*distances.frame, *matches, curvature)
-            H = _unpack(packed)
         turn = np.kron(_padded(distances.frame[1]), _padded(distances.frame[0]))
         N_back = turn @ N @ turn.T
         return turn @ g, N_back, N_back if H is N else turn @ H @ turn.T
@@ -189,8 +190,9 @@ class Mahalanobis(Reprojection):
         white = np.ascontiguousarray((np.swapaxes(self.L2, 1, 2) @ F @ self.L1).transpose(1, 2, 0))
         frame = self.kernels.bilinear_frame(white)
         origin = self._measured
-        multiplier, change, d = self.kernels.foot_point_each(*frame, origin, origin)
-        unsettled = _unsettled(multiplier, change, d)
+        with np.errstate(all="ignore"):
+            multiplier, change, d = self.kernels.foot_point_each(*frame, origin, origin)
+            unsettled = _unsettled(multiplier, change, d)
         if unsettled.any():
             part = [np.ascontiguousarray(value[..., unsettled]) for value in (*frame, origin)]
             safe = self.kernels.foot_point_safe_each(*part, part[-1])
@@ -250,12 +252,13 @@ class _ClosedForm:
     def normal(
         self, F: Array, distances: Distances, weight: Array, curvature: Array | None
     ) -> tuple[Array, Array, Array]:
-        g, packed = self._gauss_newton(F, self.q1, self.q2, weight)
-        N = _unpack(packed)
         if curvature is None:
+            _, g, packed = self._gauss_newton(F, self.q1, self.q2, weight)
+            N = _unpack(packed)
             return g, N, N
-        _, packed = self._newton(F, self.q1, self.q2, weight, curvature)
-        return g, N, _unpack(packed)
+        _, g, *both = self._newton(F, self.q1, self.q2, weight, curvature)
+        N, H = map(_unpack, both)
+        return g, N, H
 
 
 class Sampson(_ClosedForm):
@@ -279,8 +282,8 @@ CRITERIA: dict[str, type[Reprojection] | type[Sampson] | type[Epipolar]] = {
 
 
 def _unsettled(multiplier: Array, change: Array, d: Array) -> NDArray[np.bool_]:
-    """Return which foot points the last Newton step has still moved."""
-    return np.asarray(np.abs(change * d) > (_SETTLED * np.abs(d) + 1e-15) * np.abs(multiplier))
+    """Return which foot points the last Newton step has still moved, or lost (NaN)."""
+    return ~np.asarray(np.abs(change * d) <= (_SETTLED * np.abs(d) + 1e-15) * np.abs(multiplier))
 
 
 def _unwhitening(q: Array, covariance: Array) -> Array:

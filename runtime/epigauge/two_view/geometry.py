@@ -92,7 +92,7 @@ def reprojection_distances(
 
 
 def sampson_distances(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> Array:
-    """Return the gradient-weighted (Sampson) distance of each match, C / |dC/d(x1, x2)|.
+    """Return the gradient-weighted (Sampson) distance of each match, C / norm(dC/d(x1, x2)).
 
     Parameters
     ----------

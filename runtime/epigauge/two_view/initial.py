@@ -47,8 +47,10 @@ def fundamental_8point(x1: ArrayLike, x2: ArrayLike) -> Array:
     n1, T1 = _normalize(x1)
     n2, T2 = _normalize(x2)
     products = (n2[:, :, None] * n1[:, None, :]).reshape(len(n1), 9)
-    F = np.linalg.svd(np.linalg.qr(products, mode="r"))[2][-1].reshape(3, 3)
-    U, values, Vt = np.linalg.svd(F)
+    f = np.linalg.svd(np.linalg.qr(products, mode="r"))[2][-1]
+    # One of the two signs, whatever the linear algebra: the first large entry is positive.
+    f = f * np.sign(f[np.argmax(np.abs(f) > 0.5 * np.max(np.abs(f)))])
+    U, values, Vt = np.linalg.svd(f.reshape(3, 3))
     F = T2.T @ (U[:, :2] * values[:2]) @ Vt[:2] @ T1
     return np.asarray(F / np.linalg.norm(F))
 

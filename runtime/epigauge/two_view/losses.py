@@ -6,10 +6,10 @@ the solver exactly: rho' as the weight of a match, rho'' in the exact Hessian.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from epigauge_generated.numpy_backend import losses
 from numpy.typing import NDArray
 
 __all__ = ["EFFICIENT", "LOSSES", "Loss", "Mixture", "robust_scale"]
@@ -22,35 +22,8 @@ def _linear(s: Array) -> _Values:
     return s, np.ones_like(s), np.zeros_like(s)
 
 
-def _huber(s: Array) -> _Values:
-    inside = s <= 1.0
-    root = np.sqrt(np.where(inside, 1.0, s))
-    value = np.where(inside, s, 2.0 * root - 1.0)
-    return value, 1.0 / root, np.where(inside, 0.0, -0.5 / root**3)
-
-
-def _soft_l1(s: Array) -> _Values:
-    root = np.sqrt(1.0 + s)
-    return 2.0 * (root - 1.0), 1.0 / root, -0.5 / root**3
-
-
-def _cauchy(s: Array) -> _Values:
-    return np.log1p(s), 1.0 / (1.0 + s), -1.0 / (1.0 + s) ** 2
-
-
-def _truncated(s: Array) -> _Values:
-    inside = s <= 1.0
-    return np.minimum(s, 1.0), inside.astype(np.float64), np.zeros_like(s)
-
-
-#: rho, rho' and rho'' by name; the first four are SciPy's.
-LOSSES: dict[str, Callable[[Array], _Values]] = {
-    "linear": _linear,
-    "huber": _huber,
-    "soft_l1": _soft_l1,
-    "cauchy": _cauchy,
-    "truncated": _truncated,
-}
+#: The losses by name; all but the linear one are generated, the first four are SciPy's.
+LOSSES = ("linear", "huber", "soft_l1", "cauchy", "truncated")
 
 
 #: Scale over the standard deviation of the noise at which a loss keeps 95 % efficiency on clean
@@ -70,9 +43,10 @@ class Loss:
         """Return the cost of each match, doubled, and its first two derivatives by the square."""
         if self.name == "linear":
             return _linear(squared)
-        c2 = self.scale**2
-        value, first, second = LOSSES[self.name](squared / c2)
-        return c2 * value, first, second / c2
+        squared = np.asarray(squared)
+        value, first, second = np.empty((3, *squared.shape))
+        getattr(losses, f"loss_{self.name}")(squared, self.scale**2, value, first, second)
+        return value, first, second
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from epigauge.two_view.diagnostics import Evidence, evidence
 from epigauge.two_view.losses import Loss
 from epigauge.two_view.solve import Matches, Options, Solution, joined, minimize
 
-__all__ = ["AMBIGUOUS", "Minimum", "Search", "perturbed", "search"]
+__all__ = ["AMBIGUOUS", "Minimum", "Search", "chosen", "perturbed", "search"]
 
 Array = NDArray[np.float64]
 
@@ -156,14 +156,19 @@ def search(
         Starts that end without convergence are left out, but for the first.
     """
     found: list[Solution] = []
-    groups: list[list[Solution]] = []
     for F in perturbed(matches, start, count):
-        solution = minimize(matches, options, F, callback)
-        found.append(solution)
+        found.append(minimize(matches, options, F, callback))
+        if found[-1].outcome.status == -2:
+            break
+    return chosen(matches, options, found)
+
+
+def chosen(matches: Matches, options: Options, found: list[Solution]) -> Search:
+    """Group the solutions of several starts and choose the best, as `search` does."""
+    groups: list[list[Solution]] = []
+    for solution in found:
         if solution.outcome.status > 0 or not groups:
             _add(groups, solution)
-        if solution.outcome.status == -2:
-            break
     # The lowest of each group stands for it
     groups = [sorted(group, key=_cost) for group in groups]
     groups.sort(key=lambda group: _cost(group[0]))
@@ -177,10 +182,10 @@ def search(
         )
         for group, case in zip(groups, cases, strict=True)
     )
-    chosen = next((k for k, minimum in enumerate(minima) if minimum.oriented), 0)
-    best = groups[chosen][0]
-    noise_px = cases[chosen].noise * matches.frame.scale
-    bound = minima[chosen].cost + 0.5 * AMBIGUOUS * noise_px**2
+    first = next((k for k, minimum in enumerate(minima) if minimum.oriented), 0)
+    best = groups[first][0]
+    noise_px = cases[first].noise * matches.frame.scale
+    bound = minima[first].cost + 0.5 * AMBIGUOUS * noise_px**2
     rivals = sum(minimum.oriented and minimum.cost <= bound for minimum in minima)
     history = found[0].outcome.history
     for solution in found[1:]:
@@ -192,7 +197,7 @@ def search(
         njev=sum(solution.outcome.njev for solution in found),
         nit=sum(solution.outcome.nit for solution in found),
     )
-    return Search(replace(best, outcome=outcome), cases[chosen], minima, rivals > 1)
+    return Search(replace(best, outcome=outcome), cases[first], minima, rivals > 1)
 
 
 def _cost(solution: Solution) -> float:

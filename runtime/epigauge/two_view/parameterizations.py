@@ -281,34 +281,34 @@ class Reduced:
     """
 
     def __init__(self, inner: Ortho | Block, basis: Array) -> None:
-        self._inner, self._basis = inner, basis
+        self.inner, self.basis = inner, basis
         self.dimension = basis.shape[1]
 
     def recombined(self, mixing: Array) -> Reduced:
         """Return the same restriction with other parameters: `mixing` (k, k) times the new ones."""
-        return Reduced(self._inner, self._basis @ mixing)
+        return Reduced(self.inner, self.basis @ mixing)
 
     def start(self, F: Array) -> Any:
         """Return the inner representation."""
-        return self._inner.start(F)
+        return self.inner.start(F)
 
     def fundamental(self, estimate: Any) -> Array:
         """Return F."""
-        return self._inner.fundamental(estimate)
+        return self.inner.fundamental(estimate)
 
     def derivatives(self, estimate: Any) -> tuple[Array, Array]:
         """Return derivatives by the directions left."""
-        first, second = self._inner.derivatives(estimate)
-        return first @ self._basis, self._basis.T @ second @ self._basis
+        first, second = self.inner.derivatives(estimate)
+        return first @ self.basis, self.basis.T @ second @ self.basis
 
     def camera(self, estimate: Any) -> tuple[Array, Array]:
         """Return P' and its derivative by the directions left."""
-        P2, derivative = self._inner.camera(estimate)
-        return P2, derivative @ self._basis
+        P2, derivative = self.inner.camera(estimate)
+        return P2, derivative @ self.basis
 
     def retract(self, estimate: Any, delta: Array) -> Any:
         """Return the estimate moved along the directions left."""
-        return self._inner.retract(estimate, self._basis @ delta)
+        return self.inner.retract(estimate, self.basis @ delta)
 
 
 class Remapped:
@@ -328,17 +328,17 @@ class Remapped:
     """
 
     def __init__(self, inner: Reduced, to1: Array, to2: Array, anchor: Array | None = None) -> None:
-        self._inner, self._anchor = inner, anchor
+        self.inner, self._anchor = inner, anchor
         self._to1, self._to2 = to1, to2
         self._from1 = np.linalg.inv(to1)
-        self._entries = np.kron(np.linalg.inv(to2).T, self._from1.T)
+        self.entries = np.kron(np.linalg.inv(to2).T, self._from1.T)
         self.dimension = inner.dimension
 
     def start(self, F: Array) -> Any:
         """Return the inner representation, of the anchor if there is one."""
         if self._anchor is not None:
-            return self._inner.start(self._anchor)
-        return self._inner.start(self._to2.T @ F @ self._to1)
+            return self.inner.start(self._anchor)
+        return self.inner.start(self._to2.T @ F @ self._to1)
 
     def balanced(self, F: Array) -> Remapped:
         """Return the same with parameters that move F at right angles and equally far.
@@ -354,28 +354,28 @@ class Remapped:
         # The unit matrix below keeps the triangle regular where directions coincide
         stacked = np.vstack([derivative / sizes, 1e-6 * np.eye(self.dimension)])
         triangle = np.linalg.qr(stacked)[1] * sizes / np.linalg.norm(f)
-        inner = self._inner.recombined(np.linalg.inv(triangle))
+        inner = self.inner.recombined(np.linalg.inv(triangle))
         return Remapped(inner, self._to1, self._to2, self._anchor)
 
     def fundamental(self, estimate: Any) -> Array:
         """Return F in the coordinates computed in."""
-        return (self._entries @ self._inner.fundamental(estimate).ravel()).reshape(3, 3)
+        return (self.entries @ self.inner.fundamental(estimate).ravel()).reshape(3, 3)
 
     def derivatives(self, estimate: Any) -> tuple[Array, Array]:
         """Return derivatives of F in the coordinates computed in."""
-        first, second = self._inner.derivatives(estimate)
-        return self._entries @ first, np.tensordot(self._entries, second, axes=1)
+        first, second = self.inner.derivatives(estimate)
+        return self.entries @ first, np.tensordot(self.entries, second, axes=1)
 
     def camera(self, estimate: Any) -> tuple[Array, Array]:
         """Return P' for P = (I | 0) in the coordinates computed in."""
-        P2, derivative = self._inner.camera(estimate)
+        P2, derivative = self.inner.camera(estimate)
         back = np.eye(4)
         back[:3, :3] = self._from1
         return self._to2 @ P2 @ back, np.kron(self._to2, back.T) @ derivative
 
     def retract(self, estimate: Any, delta: Array) -> Any:
         """Return the estimate moved by the inner update."""
-        return self._inner.retract(estimate, delta)
+        return self.inner.retract(estimate, delta)
 
 
 def frozen_directions(parts: Parts, fix: tuple[str, ...]) -> Array:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,9 +24,11 @@ from epigauge._arguments import (
     check_general_position,
 )
 from epigauge.errors import ArgumentError
+from epigauge.two_view import native
 from epigauge.two_view.assemble import assembled
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.criteria import CRITERIA
+from epigauge.two_view.express import express
 from epigauge.two_view.initial import fundamental_8point
 from epigauge.two_view.losses import LOSSES
 from epigauge.two_view.minima import search
@@ -169,7 +174,81 @@ def refine_fundamental(
     .. [BS04] A. Bartoli, P. Sturm, "Nonlinear estimation of the fundamental matrix with minimal
        parameters", PAMI 26(3), 2004.
     """
+    plan = _plan(
+        *(parameterization, criterion, structure, damping, hessian, loss, loss_scale_px),
+        *(fix, bias_correction, ftol, xtol, gtol, max_iter, starts, noise_px, backend),
+    )
+    options, noise_px, starts = plan.options, plan.noise_px, plan.starts
+    special = essential or K1 is not None or K2 is not None or callback is not None
+    if plan.native is not None and not special and covariance1 is None and covariance2 is None:
+        result = _express(x1, x2, F0, weights, plan)
+        if result is not None:
+            return result
     x1, x2 = as_matches(x1, x2, general_position=True)
+    options = replace(options, calibration=_calibration(essential, K1, K2))
+    _check_combination(options)
+    if starts > 1 and options.fix:
+        raise ArgumentError("starts", f"is {starts} with fix", "1: the start holds what is fixed")
+    w = np.ones(len(x1)) if weights is None else as_weights(weights, len(x1))
+    start = _start(x1, x2, w) if F0 is None else _given_start(F0, x1, x2, w)
+    covariances = _covariances(covariance1, covariance2, options, starts, len(x1))
+    matches = Matches.of(x1, x2, w, start, kernels.table(backend), covariances)
+    options = replace(options, anchor=start if options.fix else None)
+    found = search(matches, options, matches.frame.from_pixels(start), starts, callback)
+    return assembled(found, options, matches, noise_px)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Checked options, and `native` where the short way takes them."""
+
+    options: Options
+    noise_px: float | None
+    starts: int
+    native: native.PairOptions | None
+
+
+def _plan(*choices: Any) -> Plan:
+    """Check the options, once for equal ones."""
+    *own, starts, noise_px, backend = choices
+    own[7], own[8] = _parts(own[7]), bool(own[8])
+    try:
+        options, pairs = _checked(*own)
+    except TypeError:  # something unhashable: the check itself says what
+        options, pairs = _checked.__wrapped__(*own)
+    starts = as_count("starts", starts)
+    if noise_px is not None:
+        noise_px = as_positive("noise_px", noise_px)
+    if starts > 1 or kernels.table(backend).name != "c":
+        pairs = None
+    return Plan(options, noise_px, starts, pairs)
+
+
+def plan_of(options: dict[str, Any]) -> Plan:
+    """Check keyword options of `refine_fundamental`, the others at their defaults.
+
+    `native` is None too where an option asks for more than the short way knows.
+    """
+    chosen = _DEFAULTS | options
+    plan = _plan(*(chosen[name] for name in _PLANNED))
+    special = any(chosen[name] is not _DEFAULTS[name] for name in _DEFAULTS if name not in _PLANNED)
+    return replace(plan, native=None) if special else plan
+
+
+@lru_cache(maxsize=64, typed=True)
+def _checked(
+    parameterization: str,
+    criterion: str,
+    structure: str,
+    damping: str,
+    hessian: str,
+    loss: str,
+    loss_scale_px: float | str,
+    fix: tuple[str, ...],
+    bias_correction: bool,
+    *stopping: Any,
+) -> tuple[Options, native.PairOptions | None]:
+    ftol, xtol, gtol, max_iter = stopping
     options = Options(
         parameterization=as_choice(
             "parameterization", parameterization, (*PARAMETERIZATIONS, *REDUNDANT)
@@ -178,28 +257,41 @@ def refine_fundamental(
         structure=as_choice("structure", structure, ("eliminated", "joint")),
         damping=as_choice("damping", damping, DAMPINGS),
         hessian=as_choice("hessian", hessian, ("exact", "gauss-newton")),
-        fix=_parts(fix),
-        calibration=_calibration(essential, K1, K2),
+        fix=fix,
         loss=as_choice("loss", loss, LOSSES),
-        bias_correction=bool(bias_correction),
+        bias_correction=bias_correction,
         loss_scale_px=None
         if loss_scale_px == "auto"
         else as_positive("loss_scale_px", loss_scale_px),
         stopping=lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter),
     )
-    _check_combination(options)
-    starts = as_count("starts", starts)
-    if starts > 1 and options.fix:
-        raise ArgumentError("starts", f"is {starts} with fix", "1: the start holds what is fixed")
-    if noise_px is not None:
-        noise_px = as_positive("noise_px", noise_px)
-    w = np.ones(len(x1)) if weights is None else as_weights(weights, len(x1))
-    start = _start(x1, x2, w) if F0 is None else _given_start(F0, x1, x2, w)
-    covariances = _covariances(covariance1, covariance2, options, starts, len(x1))
-    matches = Matches.of(x1, x2, w, start, kernels.table(backend), covariances)
-    options = replace(options, anchor=start if options.fix else None)
-    found = search(matches, options, matches.frame.from_pixels(start), starts, callback)
-    return assembled(found, options, matches, noise_px)
+    usual = (parameterization, structure, loss) == ("ortho", "eliminated", "linear")
+    if not usual or fix or bias_correction:
+        return options, None
+    exact = hessian == "exact"
+    return options, native.pair_options(criterion, exact, damping, options.stopping)
+
+
+def _express(
+    x1: ArrayLike, x2: ArrayLike, F0: ArrayLike | None, weights: ArrayLike | None, plan: Plan
+) -> FundamentalResult | None:
+    """Go the short way; None where that finds something that is not plainly in order."""
+    if not (_is_plain(x1) and _is_plain(x2) and x1.shape == x2.shape):  # type: ignore[union-attr]
+        x1, x2 = as_matches(x1, x2, general_position=True)
+    assert isinstance(x1, np.ndarray)
+    assert isinstance(x2, np.ndarray)
+    if F0 is not None:
+        F0 = np.ascontiguousarray(as_fundamental(F0))
+    w = None if weights is None else np.ascontiguousarray(as_weights(weights, len(x1)))
+    assert plan.native is not None
+    return express(x1, x2, F0, w, plan.options, plan.native, plan.noise_px)
+
+
+def _is_plain(x: ArrayLike) -> bool:
+    """Tell whether points need no conversion."""
+    if type(x) is not np.ndarray or x.dtype != np.float64 or not x.flags.c_contiguous:
+        return False
+    return x.ndim == 2 and x.shape[1] == 2
 
 
 def _parts(fix: str | Sequence[str]) -> tuple[str, ...]:
@@ -288,3 +380,25 @@ def _start(x1: Array, x2: Array, weights: Array) -> Array:
     if np.count_nonzero(counts) < 8:
         raise ArgumentError("weights", "leave fewer than 8 matches", "8 positive ones, or F0")
     return fundamental_8point(x1[counts], x2[counts])
+
+
+#: Keyword options of `refine_fundamental` with their defaults, and those that a plan is made of.
+_DEFAULTS: dict[str, Any] = {
+    name: parameter.default
+    for name, parameter in inspect.signature(refine_fundamental).parameters.items()
+    if parameter.kind is parameter.KEYWORD_ONLY
+}
+_PLANNED = (
+    *("parameterization", "criterion", "structure", "damping", "hessian", "loss", "loss_scale_px"),
+    *(
+        "fix",
+        "bias_correction",
+        "ftol",
+        "xtol",
+        "gtol",
+        "max_iter",
+        "starts",
+        "noise_px",
+        "backend",
+    ),
+)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from epigauge.errors import ArgumentError
 from epigauge.lm import Row
+from epigauge.two_view._partial import Partial
 from epigauge.two_view.covariance import Uncertainty
 from epigauge.two_view.diagnostics import Evidence, diagnose
 from epigauge.two_view.minima import Minimum
@@ -20,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class FundamentalResult:
+class FundamentalResult(Partial):
     """A fundamental matrix with everything known about it. All lengths are in pixels.
 
     Attributes

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge.kernels import Table
 from epigauge.linear import Levenberg, Seber
+from epigauge.two_view import native
 from epigauge.two_view.conditioning import Conditioning, condition, displaced
 from epigauge.two_view.criteria import CRITERIA, Criterion, Mahalanobis, Reprojection
 from epigauge.two_view.eliminated import EliminatedProblem
@@ -206,6 +207,19 @@ def _minimize_once(
     scale_px = 0.0 if options.loss_scale_px is None else options.loss_scale_px
     loss = options.scaled_loss(scale_px / matches.frame.scale)
     chart = _chart(matches, options, start)
+    if _is_native(matches, options, chart, callback):
+        exact = options.hessian == "exact"
+        compiled = native.minimize(
+            chart,
+            chart.start(start),
+            (matches.q1, matches.q2, matches.weights),
+            (options.criterion, options.loss, options.damping, exact),
+            loss.scale,
+            options.stopping,
+            matches.frame.scale**2,
+        )
+        motion = compiled.state.motion
+        return Solution(chart.fundamental(motion), chart, motion, compiled, scale_px)
     problem = _problem(matches, options, chart, loss)
     outcome: lm.Outcome[Any] = lm.minimize(
         problem,
@@ -226,6 +240,18 @@ def _minimize_once(
     if outcome.status > 0 and not isinstance(problem, EliminatedProblem):
         outcome = replace(outcome, status=_settled(matches, F, loss, outcome))
     return Solution(F, chart, motion, outcome, scale_px)
+
+
+def _is_native(
+    matches: Matches,
+    options: Options,
+    chart: Parameterization,
+    callback: Callable[[lm.Row], object] | None,
+) -> bool:
+    """Tell whether the compiled loop does the same, sooner."""
+    over_F = options.structure == "eliminated" and options.parameterization not in REDUNDANT
+    plain = matches.table.name == "c" and matches.covariances is None and callback is None
+    return over_F and plain and native.supports(chart)
 
 
 def _settled(matches: Matches, F: Array, loss: Loss, outcome: lm.Outcome[Any]) -> int:

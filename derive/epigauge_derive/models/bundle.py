@@ -1,0 +1,167 @@
+"""Many views: what one observation adds to the normal equations, and one point's own 4x4 algebra.
+
+With h = P Q, the image point q_hat(h) and a = d q_hat / d h (2x3), the Jacobians are J_P = a x Q^T
+and J_Q = a P: every camera block is a sum of (3x3) x (Q Q^T), every coupling is (3x4) x Q. The
+kernels give the small factors, the accumulation multiplies them out (math: Kronecker structure of
+the projective Schur complement).
+"""
+
+from __future__ import annotations
+
+import sympy as sp
+
+from epigauge_derive.kernel import Input, Kernel, Let, Output, at, jacobian, upper
+
+P, Q, MEASURED, WEIGHT = Input("P", (3, 4)), Input("Q", (4,)), Input("q", (2,)), Input("weight")
+T = Input("T", (4, 4))
+V, W, G, LAM = Input("V", (10,)), Input("W", (10,)), Input("g", (4,)), Input("lam")
+
+
+def kernels() -> list[Kernel]:
+    """Return the factors of one observation's normal equations, and the 4x4 systems of points."""
+    return [*_observation(), *_point()]
+
+
+def _observation() -> list[Kernel]:
+    h = sp.Matrix(sp.symbols("h0:3", real=True))
+    u, v, nearness = sp.symbols("u v nearness", real=True)
+    a = jacobian([h[0] / h[2], h[1] / h[2]], list(h))
+    # The derivative of log |depth| by h.
+    log_depth = sp.Matrix([[sp.diff(h[2], entry) / h[2] for entry in h]])
+    # By the image point (u, v) and 1 / h2, so that there is one division.
+    depths = {h[0]: u / nearness, h[1]: v / nearness, h[2]: 1 / nearness}
+    a, log_depth = at(a, depths), at(log_depth, depths)
+    image = Let(
+        dict(zip(h, P.matrix() * Q.matrix(), strict=True))
+        | {nearness: 1 / h[2], u: h[0] * nearness, v: h[1] * nearness}
+    )
+    weight = WEIGHT.symbol()
+    r = MEASURED.matrix() - sp.Matrix([u, v])
+    squared = Output.of("squared", (r.T * r)[0])
+    J_Q, Z_Q = a * P.matrix(), log_depth * P.matrix()
+    return [
+        Kernel(
+            "squared_distance",
+            "squared distance |q - q_hat|^2 of a projected point to its measurement.",
+            (P, Q, MEASURED),
+            (squared,),
+            (image,),
+        ),
+        Kernel(
+            "point_normal",
+            "what an observation adds to its point's normal equations: w J_Q^T J_Q and "
+            "w Z_Q^T Z_Q (upper triangles; Z = d log depth), -w J_Q^T (q - q_hat), and "
+            "|q - q_hat|^2.",
+            (P, Q, MEASURED, WEIGHT),
+            (
+                Output.of("V", upper(weight * J_Q.T * J_Q)),
+                Output.of("D", upper(weight * Z_Q.T * Z_Q)),
+                Output.of("g", -weight * J_Q.T * r),
+                squared,
+            ),
+            (image,),
+        ),
+        Kernel(
+            "camera_normal",
+            "the factors of what an observation adds to its camera's normal equations: "
+            "J_P^T J_P = A x Q Q^T (A: upper triangle of 3x3, with weight), Z_P^T Z_P = depth Q Q^T "
+            "for the last row of P and zero for the others, -w J_P^T (q - q_hat) = e x Q.",
+            (P, Q, MEASURED, WEIGHT),
+            (
+                Output.of("A", upper(weight * a.T * a)),
+                Output.of("depth", weight * log_depth[2] ** 2),
+                Output.of("e", -weight * a.T * r),
+            ),
+            (image,),
+        ),
+        Kernel(
+            "coupling",
+            "the factor of camera and point coupled by an observation, w J_P^T J_Q T = Y x Q with "
+            "Y = w a^T a P T, T a change of the point's parameters.",
+            (P, Q, WEIGHT, T),
+            (Output.of("Y", weight * a.T * (a * P.matrix() * T.matrix())),),
+            (image,),
+        ),
+    ]
+
+
+def _symmetric(entries: list[sp.Symbol]) -> sp.Matrix:
+    """Unpack an upper triangle of four rows."""
+    index = {}
+    for i in range(4):
+        for j in range(i, 4):
+            index[i, j] = index[j, i] = len(set(index.values()))
+    return sp.Matrix(4, 4, lambda i, j: entries[index[i, j]])
+
+
+def _cholesky(name: str, matrix: sp.Matrix, values: dict[sp.Symbol, sp.Expr]) -> sp.Matrix:
+    """Define the factor L, A = L L^T, and return L^-1; both by symbols, entry by entry."""
+    L, inverse = sp.zeros(4, 4), sp.zeros(4, 4)
+    reciprocal = []
+    for j in range(4):
+        for i in range(j, 4):
+            rest = matrix[i, j] - sum(L[i, k] * L[j, k] for k in range(j))
+            symbol = sp.Symbol(f"{name}{i}{j}", real=True)
+            values[symbol] = sp.sqrt(rest) if i == j else rest * reciprocal[j]
+            L[i, j] = symbol
+            if i == j:
+                reciprocal.append(sp.Symbol(f"{name}_inverse{i}{i}", real=True))
+                values[reciprocal[j]] = 1 / symbol
+    for j in range(4):
+        inverse[j, j] = reciprocal[j]
+        for i in range(j + 1, 4):
+            symbol = sp.Symbol(f"{name}_inverse{i}{j}", real=True)
+            values[symbol] = -reciprocal[i] * sum(L[i, k] * inverse[k, j] for k in range(j, i))
+            inverse[i, j] = symbol
+    return inverse
+
+
+def _point() -> list[Kernel]:
+    V_matrix, W_matrix = (_symmetric(argument.entries()) for argument in (V, W))
+    lam, g = LAM.symbol(), G.matrix()
+    plain: dict[sp.Symbol, sp.Expr] = {}
+    root = _cholesky("L", V_matrix, plain).T
+
+    # Whitened first: where W = 1 the condition is about 1 / lam whatever the basis.
+    values: dict[sp.Symbol, sp.Expr] = {}
+    across = _cholesky("L", W_matrix, values)
+    product = across * V_matrix * across.T
+    white = sp.zeros(4, 4)
+    for i in range(4):
+        for j in range(i, 4):
+            symbol = sp.Symbol(f"N{i}{j}", real=True)
+            values[symbol] = product[i, j]
+            white[i, j] = white[j, i] = symbol
+    damped_root = across.T * _cholesky("M", white + lam * sp.eye(4), values).T
+
+    own: dict[sp.Symbol, sp.Expr] = {}
+    inverse = _cholesky("L", V_matrix + lam * (V_matrix + W_matrix), own)
+    half = sp.Matrix(sp.symbols("y0:4", real=True))
+    own |= dict(zip(half, inverse * g, strict=True))
+    return [
+        Kernel(
+            "inverse_root",
+            "upper triangular T with T T^T = V^-1, from the upper triangle of V.",
+            (V,),
+            (Output.of("T", root),),
+            (Let(plain),),
+        ),
+        Kernel(
+            "damped_inverse_root",
+            "upper triangular T with T T^T = (V + lam W)^-1, found where W = 1; upper triangles.",
+            (V, W, Input("lam", (), shared=True)),
+            (Output.of("T", damped_root),),
+            (Let(values),),
+        ),
+        Kernel(
+            "point_step",
+            "a point's own damped step -(V + lam (V + W))^-1 g and the decrease of the cost that "
+            "it promises at most, g^T (V + lam (V + W))^-1 g; upper triangles.",
+            (V, W, G, LAM),
+            (
+                Output.of("step", -inverse.T * half),
+                Output.of("promised", (half.T * half)[0]),
+            ),
+            (Let(own),),
+        ),
+    ]

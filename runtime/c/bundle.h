@@ -1,0 +1,111 @@
+/* Many views: the accumulation over observations, point by point, and the reduced system.
+
+   The readable reference is Python: epigauge/multi_view/problem.py, coupling.py, system.py. A test
+   compares both. Nothing here is a formula of the geometry: h, J_P, J_Q and all 4x4 algebra of a
+   point are generated kernels, run over many points at once.
+
+   Points are worked on in chunks of equal or similar numbers of observations. A chunk has M lanes
+   (points, M a multiple of EG_LANES) and L slots: slot s holds the s-th observation of every lane,
+   so that what is summed over the observations of a point is added lane by lane. Lanes are in
+   falling order of their numbers of observations; what is missing repeats another observation
+   without weight. */
+#ifndef EPIGAUGE_BUNDLE_H
+#define EPIGAUGE_BUNDLE_H
+
+#include <stdint.h>
+
+#include "epigauge_kernels.h"
+
+#define EG_LANES 8
+
+/* The moments of a point, the ten entries of Q Q^T, are padded to twelve. A sum of r factors times
+   moments holds, so that no vector crosses a cache line, the first eight moments of every factor,
+   then the other four of every factor. Each lane has its moments and Q itself in 16 entries. */
+#define EG_MOMENTS 12
+#define EG_SUM(r, e, k) ((k) < 8 ? 8 * (e) + (k) : 8 * (r) + 4 * (e) + (k) - 8)
+
+/* A camera: sums for the six entries of A and for depth, the gradient, filled up. */
+#define EG_CAMERA 96
+
+/* A pair of cameras: sums for the nine entries of a 3x3 matrix, filled up. */
+#define EG_PAIR 112
+
+typedef struct {
+    ptrdiff_t n_views, n_points, n_chunks;
+    const ptrdiff_t *lanes;  /* (n_chunks + 1): where the lanes of each chunk begin */
+    const ptrdiff_t *rows;   /* (n_chunks + 1): where its observations begin, M L of them */
+    const int32_t *point;    /* point of each lane */
+    const int32_t *count;    /* observations of each lane, 0 for a lane that fills up */
+    const int32_t *view;     /* view of each observation, slot by slot; rising within a point */
+    const double *q;         /* measurements: for each slot M first and M second coordinates */
+    const double *weights;
+    double least;            /* least weight in the normal equations */
+    double scale2;           /* squared scale of the loss */
+    ptrdiff_t loss;          /* 0 linear, 1 huber, 2 soft_l1, 3 cauchy, 4 truncated */
+} eg_bundle;
+
+/* The reduced system: block row k holds the blocks from column first[k] to k, each of a rows; row r
+   of block row k begins at S + base[k] + r stride[k]. */
+typedef struct {
+    ptrdiff_t n, a;
+    const int32_t *first;
+    const ptrdiff_t *slot;   /* (n + 1): number of the first block of each row */
+    const ptrdiff_t *base, *stride;
+} eg_envelope;
+
+/* ---------------------------------------------------------------- bundle.c */
+
+EG_EXPORT void eg_bundle_pack(
+    eg_bundle *bundle, const ptrdiff_t *first, const ptrdiff_t *view, const double *q,
+    const double *weights, int32_t *packed_view, double *packed_q, double *packed_weights);
+
+EG_EXPORT int eg_bundle_costs(
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *P, const double *Q,
+    double *costs);
+
+EG_EXPORT int eg_bundle_linearize(
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *P, const double *Q,
+    double *V, double *D, double *g, double *cameras);
+
+EG_EXPORT int eg_bundle_triangulate(
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *P, double *Q,
+    double *costs, ptrdiff_t iterations, double lam, double factor, double tolerance);
+
+/* ---------------------------------------------------------------- bundle_schur.c */
+
+EG_EXPORT int eg_bundle_inverse_roots(
+    ptrdiff_t m, const double *V, const double *W, double lam, const double *g, double *T,
+    double *half);
+
+EG_EXPORT int eg_bundle_schur(
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *P, const double *Q,
+    const double *T, const double *half, const eg_envelope *envelope, double *pairs,
+    double *cameras);
+
+EG_EXPORT int eg_bundle_couple(
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *P, const double *Q,
+    const double *T, const double *x, const double *y, double *points, double *cameras);
+
+EG_EXPORT double eg_bundle_point_steps(
+    ptrdiff_t m, const double *T, const double *half, const double *coupled, const double *W,
+    double *step);
+
+/* ---------------------------------------------------------------- bundle_reduced.c */
+
+EG_EXPORT void eg_bundle_camera_blocks(
+    ptrdiff_t n, const double *cameras, double *U, double *D, double *g);
+
+EG_EXPORT int eg_bundle_whiten(
+    ptrdiff_t n, const double *U, const double *W, double lam, double *A, double *white);
+
+EG_EXPORT void eg_bundle_reduce(
+    const eg_envelope *envelope, const double *pairs, const double *U, const double *A, double *S);
+
+EG_EXPORT int eg_envelope_factor(const eg_envelope *envelope, double *S);
+
+EG_EXPORT void eg_envelope_solve(
+    const eg_envelope *envelope, const double *S, ptrdiff_t count, double *x);
+
+EG_EXPORT void eg_bundle_neighbours(const eg_bundle *bundle, unsigned char *together);
+
+#endif

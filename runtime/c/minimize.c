@@ -1,0 +1,283 @@
+/* The Levenberg-Marquardt loop over F: lm.py, linear.py and eliminated.py for at most seven unknowns.
+
+   Statuses, stopping rules and the rows of the history are those of runtime/epigauge/lm.py. */
+#define _POSIX_C_SOURCE 199309L
+
+#include "small.h"
+#include "two_view.h"
+
+#include <float.h>
+#include <math.h>
+#include <string.h>
+#include <time.h>
+
+/* As in lm.py and linear.py. */
+#define LAM_CEILING 1e16
+#define LAM_FACTOR 10.0
+#define LAM_START 1e-3
+#define LIFT 1e-3
+#define TINIEST 1e-300
+
+/* Cholesky pivots above this ratio prove a condition far below that of a singular matrix. */
+#define WELL_CONDITIONED 1e-8
+
+static double now(void)
+{
+#ifdef CLOCK_MONOTONIC
+    struct timespec moment;
+    clock_gettime(CLOCK_MONOTONIC, &moment);
+    return (double)moment.tv_sec + 1e-9 * (double)moment.tv_nsec;
+#else
+    return (double)clock() / CLOCKS_PER_SEC;
+#endif
+}
+
+static void fundamental(const eg_options *options, const eg_chart *chart, const double *motion,
+                        double *F)
+{
+    const double *U = motion, *V = motion + 9, *rest = motion + 18;
+    double own[9];
+    if (options->chart == EG_ORTHO) {
+        eg_fundamental_from_factors(1, U, V, rest, own);
+    } else {
+        double UM[6];
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 2; ++j)
+                UM[2 * i + j] = U[3 * i] * rest[j] + U[3 * i + 1] * rest[2 + j];
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j)
+                own[3 * i + j] = UM[2 * i] * V[3 * j] + UM[2 * i + 1] * V[3 * j + 1];
+    }
+    if (chart->entries)
+        eg_product(9, 9, 1, chart->entries, own, F);
+    else
+        memcpy(F, own, sizeof own);
+}
+
+static void retract(const eg_options *options, const eg_chart *chart, const double *motion,
+                    const double *step, double *moved)
+{
+    double delta[7];
+    if (chart->basis)
+        eg_product(7, chart->p, 1, chart->basis, step, delta);
+    else
+        memcpy(delta, step, sizeof delta);
+    if (options->chart == EG_ORTHO)
+        eg_retract_factors(1, motion, motion + 9, motion + 18, delta, moved, moved + 9, moved + 18);
+    else
+        eg_block_retract(1, motion, motion + 9, motion + 18, delta, moved, moved + 9, moved + 18);
+}
+
+/* Gradient, Hessian and diagonal of J^T J by the parameters (chain rule). */
+static void linearize(eg_matches *matches, const eg_options *options, const eg_chart *chart,
+                      const double *motion, eg_outcome *state)
+{
+    double g[9], H[81], own[9], dF[63], d2F[441], DF[63], HD[63], second[49];
+    eg_normal(matches, options, state->F, g, state->normal, H);
+    if (options->chart == EG_ORTHO)
+        eg_fundamental_derivatives(1, motion, motion + 9, motion + 18, own, dF, d2F);
+    else
+        eg_block_derivatives(1, motion, motion + 9, motion + 18, own, dF, d2F);
+    const double *first = dF;
+    double inner[9];
+    memcpy(inner, g, sizeof inner);
+    if (chart->entries) {
+        eg_product(9, 9, 7, chart->entries, dF, DF);
+        eg_transposed_product(9, 9, 1, chart->entries, g, inner);
+        memcpy(dF, DF, sizeof DF);
+    }
+    if (options->exact)
+        eg_transposed_product(1, 9, 49, inner, d2F, second);
+    const int p = chart->p;
+    if (chart->basis) {
+        double half[49];
+        eg_product(9, 7, p, dF, chart->basis, DF);
+        first = DF;
+        if (options->exact) {
+            eg_product(7, 7, p, second, chart->basis, half);
+            eg_transposed_product(p, 7, p, chart->basis, half, second);
+        }
+    }
+    eg_transposed_product(p, 9, 1, first, g, state->gradient);
+    eg_product(9, 9, p, state->normal, first, HD);
+    for (int j = 0; j < p; ++j) {
+        state->diagonal[j] = 0.0;
+        for (int k = 0; k < 9; ++k)
+            state->diagonal[j] += first[k * p + j] * HD[k * p + j];
+    }
+    if (options->exact)
+        eg_product(9, 9, p, H, first, HD);
+    eg_transposed_product(p, 9, p, first, HD, state->hessian);
+    for (int i = 0; i < p; ++i)
+        for (int j = 0; j < i; ++j) {
+            const double mean = 0.5 * (state->hessian[i * p + j] + state->hessian[j * p + i]);
+            state->hessian[i * p + j] = state->hessian[j * p + i] = mean;
+        }
+    if (options->exact)
+        for (int k = 0; k < p * p; ++k)
+            state->hessian[k] += second[k];
+}
+
+static double largest(const eg_outcome *state, int p)
+{
+    double value = state->diagonal[0];
+    for (int i = 1; i < p; ++i)
+        value = fmax(value, state->diagonal[i]);
+    return value;
+}
+
+static int all_finite(int count, const double *values)
+{
+    for (int k = 0; k < count; ++k)
+        if (!isfinite(values[k]))
+            return 0;
+    return 1;
+}
+
+/* g^T H^-1 g / 2; infinity where H is not positive definite to rounding. */
+static double decrement(const eg_outcome *state, int p)
+{
+    double L[49], x[7], vectors[49], values[7], sum = 0.0;
+    const double *g = state->gradient;
+    memcpy(x, g, (size_t)p * sizeof(double));
+    const double ratio = eg_cholesky(p, state->hessian, 0.0, L);
+    if (!(ratio > 0.0))
+        return INFINITY;
+    if (ratio > WELL_CONDITIONED) {
+        eg_cholesky_solve(p, L, x);
+        for (int i = 0; i < p; ++i)
+            sum += g[i] * x[i];
+        return 0.5 * sum;
+    }
+    eg_eigen(p, state->hessian, values, vectors);
+    if (!(values[0] > DBL_EPSILON * values[p - 1]))
+        return INFINITY;
+    eg_transposed_product(p, p, 1, vectors, g, x);
+    for (int i = 0; i < p; ++i)
+        sum += x[i] * x[i] / values[i];
+    return 0.5 * sum;
+}
+
+/* The damped step; lambda is lifted until the damped Hessian is definite. */
+static void solve(const eg_outcome *state, int p, double lam, int scaled, double *step)
+{
+    double A[49], L[49], scale[7], values[7], vectors[49], x[7];
+    const double floor = DBL_EPSILON * fmax(largest(state, p), DBL_MIN);
+    for (int i = 0; i < p; ++i)
+        scale[i] = scaled ? sqrt(fmax(state->diagonal[i], floor)) : 1.0;
+    for (int i = 0; i < p; ++i) {
+        x[i] = state->gradient[i] / scale[i];
+        for (int j = 0; j < p; ++j)
+            A[i * p + j] = state->hessian[i * p + j] / (scale[i] * scale[j]);
+    }
+    if (eg_cholesky(p, A, lam, L) > WELL_CONDITIONED) {
+        eg_cholesky_solve(p, L, x);
+        for (int i = 0; i < p; ++i)
+            step[i] = -x[i] / scale[i];
+        return;
+    }
+    eg_eigen(p, A, values, vectors);
+    const double shift = values[0] + lam > 0.0 ? lam : lam - (1.0 + LIFT) * values[0];
+    double projected[7];
+    eg_transposed_product(p, p, 1, vectors, x, projected);
+    for (int i = 0; i < p; ++i)
+        projected[i] /= fmax(values[i] + shift, DBL_MIN);
+    eg_product(p, p, 1, vectors, projected, x);
+    for (int i = 0; i < p; ++i)
+        step[i] = -x[i] / scale[i];
+}
+
+static double record(double *history, eg_outcome *outcome, double cost, double lam, double norm,
+                     int accepted, double begun)
+{
+    if (history) {
+        double *row = history + (ptrdiff_t)EG_ROW * outcome->nfev;
+        row[0] = outcome->nit;
+        row[1] = cost;
+        row[2] = lam;
+        row[3] = norm;
+        row[4] = accepted;
+        row[5] = now() - begun;
+    }
+    outcome->nfev += 1;
+    return cost;
+}
+
+static double cost_of(eg_matches *matches, const eg_options *options, const double *F)
+{
+    const double cost = eg_distances(matches, options, F);
+    return isfinite(cost) ? cost : INFINITY;
+}
+
+static int loop(eg_matches *matches, const eg_options *options, const eg_chart *chart,
+                double *motion, double *history, eg_outcome *state, double floor)
+{
+    const double begun = history ? now() : 0.0;
+    const int p = chart->p;
+    fundamental(options, chart, motion, state->F);
+    state->cost = record(history, state, cost_of(matches, options, state->F), 0.0, 0.0, 1, begun);
+    linearize(matches, options, chart, motion, state);
+    state->njev = state->current = 1;
+    if (!isfinite(state->cost))
+        return -3;
+    double lam = options->scaled ? LAM_START : LAM_START * fmax(largest(state, p), TINIEST);
+    for (;;) {
+        double step[7], moved[EG_MOTION] = {0.0}, F[9], trial, decrease, steepest = 0.0, norm = 0.0;
+        for (int i = 0; i < p; ++i)
+            steepest = fmax(steepest, fabs(state->gradient[i]));
+        if (state->cost <= floor)
+            return 5;
+        if (steepest <= options->gtol)
+            return 1;
+        if (decrement(state, p) <= options->ftol * state->cost)
+            return 4;
+        const double ceiling = LAM_CEILING * fmax(largest(state, p), TINIEST);
+        const int solvable = all_finite(p * p, state->hessian) && all_finite(p, state->gradient);
+        for (;;) {
+            if (state->nit >= options->max_iter)
+                return 0;
+            if (!solvable)
+                return -1;
+            solve(state, p, lam, options->scaled, step);
+            state->nit += 1;
+            retract(options, chart, motion, step, moved);
+            fundamental(options, chart, moved, F);
+            trial = cost_of(matches, options, F);
+            decrease = state->cost - trial;
+            norm = 0.0;
+            for (int i = 0; i < p; ++i)
+                norm += step[i] * step[i];
+            norm = sqrt(norm);
+            record(history, state, trial, lam, norm, decrease > 0.0, begun);
+            state->current = decrease > 0.0;
+            if (decrease > 0.0)
+                break;
+            if (fabs(decrease) <= 1e-15 * state->cost)
+                return 2;
+            lam *= LAM_FACTOR;
+            if (lam > ceiling)
+                return -1;
+        }
+        lam /= LAM_FACTOR;
+        state->cost = trial;
+        memcpy(motion, moved, sizeof moved);
+        memcpy(state->F, F, sizeof F);
+        linearize(matches, options, chart, motion, state);
+        state->njev += 1;
+        if (decrease <= options->ftol * state->cost)
+            return 2;
+        if (norm <= options->xtol)
+            return 3;
+    }
+}
+
+void eg_minimize(eg_matches *matches, const eg_options *options, const eg_chart *chart,
+                 double *motion, double *history, eg_outcome *outcome)
+{
+    double total = 0.0;
+    for (ptrdiff_t i = 0; i < matches->m; ++i)
+        total += matches->weights[i];
+    memset(outcome, 0, sizeof *outcome);
+    /* Rounding of coordinates of size ~2 moves a distance by ~1e-15, as in eliminated.py. */
+    outcome->status = loop(matches, options, chart, motion, history, outcome, 0.5 * total * 1e-30);
+}

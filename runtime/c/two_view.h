@@ -1,0 +1,71 @@
+/* Two views, structure eliminated: what `epigauge.two_view` does in Python, for one pair or many.
+
+   The readable reference is Python: criteria.py, eliminated.py, lm.py. A test compares both,
+   evaluation by evaluation. */
+#ifndef EPIGAUGE_TWO_VIEW_H
+#define EPIGAUGE_TWO_VIEW_H
+
+#include "epigauge_kernels.h"
+
+/* Matches are kept and worked on in blocks, so that all between two passes stays in the cache. */
+#define EG_BLOCK 256
+
+/* Numbers of the choices, as _native.py has them. */
+enum { EG_REPROJECTION, EG_SAMPSON, EG_EPIPOLAR };
+enum { EG_ORTHO, EG_BLOCKS };
+enum { EG_LINEAR, EG_HUBER, EG_SOFT_L1, EG_CAUCHY, EG_TRUNCATED };
+
+typedef struct {
+    int criterion, chart, loss;
+    int exact;  /* exact Hessian, or that of Gauss-Newton */
+    int scaled; /* damping lambda diag(J^T J), or lambda I */
+    int max_iter;
+    double loss_scale2, ftol, xtol, gtol;
+    double rms, offset; /* conditioning, for pairs in pixels */
+} eg_options;
+
+/* Matches in conditioned coordinates: block b holds x, y of both images one after the other. */
+typedef struct {
+    ptrdiff_t m;
+    double *q;          /* 4 m: for each block x1, y1, x2, y2 */
+    double *weights;    /* m */
+    double *multiplier; /* m */
+    double *d;          /* m: signed distances */
+} eg_matches;
+
+/* A representation of F: U, V and sigma, or U, V and a 2x2 matrix. */
+#define EG_MOTION 22
+
+/* The representation in force: some of its directions, and F in other coordinates. */
+typedef struct {
+    int p;                 /* directions */
+    const double *basis;   /* (7, p), or NULL for all seven */
+    const double *entries; /* (9, 9) from vect(F) to vect(F) as computed with, or NULL */
+} eg_chart;
+
+typedef struct {
+    int nfev, njev, nit, status;
+    int current; /* whether the distances left behind are those of F */
+    double cost;
+    double gradient[7], hessian[49], diagonal[7];
+    double normal[81]; /* J^T J by vect(F) */
+    double F[9];
+} eg_outcome;
+
+/* iteration, cost, lambda, length of the step, accepted, seconds */
+#define EG_ROW 6
+
+double *eg_block_points(const eg_matches *matches, ptrdiff_t begin);
+
+/* Signed distances into matches->d (and multipliers); returns half the weighted robust sum. */
+double eg_distances(eg_matches *matches, const eg_options *options, const double *F);
+
+/* Gradient (9), J^T J (9, 9) and Hessian (9, 9) by vect(F), at the distances last computed. */
+void eg_normal(eg_matches *matches, const eg_options *options, const double *F, double *g,
+               double *N, double *H);
+
+/* Minimise from a motion, which is updated; history has max_iter + 1 rows, or is NULL. */
+void eg_minimize(eg_matches *matches, const eg_options *options, const eg_chart *chart,
+                 double *motion, double *history, eg_outcome *outcome);
+
+#endif

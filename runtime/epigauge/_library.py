@@ -1,0 +1,92 @@
+"""The C library: found, checked, and chosen by what the processor can do.
+
+A wheel for x86-64 holds it three times, compiled for the baseline, for AVX2 and for AVX-512; the
+arithmetic is the same to the last bit, only sums over observations round differently.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from functools import cache
+from importlib import resources
+
+from epigauge_generated.signatures import C_DIGEST
+
+from epigauge.errors import ArgumentError, BackendError
+
+__all__ = ["LEVELS", "library", "variant"]
+
+#: Names of the variants by the level of the x86-64 ABI they need, the fastest first.
+LEVELS = {4: "x86-64-v4", 3: "x86-64-v3", 0: "baseline"}
+
+#: Names one of them instead of the fastest that the processor can run.
+CHOICE = "EPIGAUGE_PROCESSOR"
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """Load the fastest variant that the processor can run and that was built.
+
+    Returns
+    -------
+    ctypes.CDLL
+        Functions are called without the global interpreter lock.
+
+    Raises
+    ------
+    BackendError
+        If there is none, or if it was built from other formulas than those of this installation.
+    ArgumentError
+        If the environment variable EPIGAUGE_PROCESSOR asks for a variant that there is not.
+    """
+    return _choose()[1]
+
+
+def variant() -> str:
+    """Return the name of the loaded variant, a value of `LEVELS`."""
+    return _choose()[0]
+
+
+@cache
+def _choose() -> tuple[str, ctypes.CDLL]:
+    files = _files()
+    if "" not in files:
+        remedy = "install a C compiler, then epigauge again"
+        raise BackendError("c", "was not built when epigauge was installed", remedy)
+    baseline = _loaded(files[""])
+    able = int(baseline.eg_processor_level())
+    usable = {
+        name: level for level, name in LEVELS.items() if level <= able and _suffix(level) in files
+    }
+    wanted = os.environ.get(CHOICE)
+    if wanted and wanted not in usable:
+        raise ArgumentError(CHOICE, f"is {wanted!r}", f"one of {', '.join(usable)}, or unset")
+    name = wanted or next(iter(usable))
+    level = usable[name]
+    return name, _loaded(files[_suffix(level)]) if level else baseline
+
+
+def _suffix(level: int) -> str:
+    return f"_v{level}" if level else ""
+
+
+def _files() -> dict[str, str]:
+    """Return the paths of the libraries by the suffix of their names."""
+    found = {}
+    for entry in resources.files("epigauge_generated.c_backend").iterdir():
+        stem, dot, extension = entry.name.rpartition(".")
+        if dot and extension in ("so", "dll", "dylib"):
+            with resources.as_file(entry) as path:
+                found[stem.removeprefix("libepigauge_kernels")] = str(path)
+    return found
+
+
+def _loaded(path: str) -> ctypes.CDLL:
+    """Load a library and check that it was built from the formulas of this installation."""
+    loaded = ctypes.CDLL(path)
+    loaded.eg_digest.restype = ctypes.c_char_p
+    if loaded.eg_digest() != C_DIGEST.encode():
+        remedy = "install epigauge again to rebuild it"
+        raise BackendError("c", "was built from other formulas", remedy)
+    return loaded
