@@ -162,7 +162,7 @@ def _draw_distances(axes: Axes, d: Array) -> None:
     finish(axes, "Residuals")
 
 
-def _spread_over_pencil(F: Array, x1: Array, x2: Array, box: Box) -> list[int]:
+def _spread_over_pencil(F: Array, x1: Array, x2: Array, box: Box, count: int = _LINES) -> list[int]:
     """Choose matches whose epipolar lines in image 2 are spread evenly, in the order of the pencil.
 
     An epipole in the picture sees the lines by their angle; one outside it by their distance from
@@ -187,7 +187,8 @@ def _spread_over_pencil(F: Array, x1: Array, x2: Array, box: Box) -> list[int]:
         place = offset * np.where(normals @ main < 0.0, -1.0, 1.0)
     low, high = np.quantile(place[away], (0.01, 0.99))
     chosen: list[int] = []
-    for target in np.linspace(low, high, min(_LINES, int(away.sum()))):
+    # Seen by angle the last line is the first one again.
+    for target in np.linspace(low, high, min(count, int(away.sum())), endpoint=not inside):
         free = np.where(away, np.abs(place - target), np.inf)
         free[chosen] = np.inf
         chosen.append(int(np.argmin(free)))

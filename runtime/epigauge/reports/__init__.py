@@ -1,0 +1,6 @@
+"""Reports in HTML, each one file that needs nothing else: no network, no other file."""
+
+from epigauge.reports.pair import save_pair_report
+from epigauge.reports.viewer import save_viewer
+
+__all__ = ["save_pair_report", "save_viewer"]

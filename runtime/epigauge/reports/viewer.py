@@ -1,0 +1,168 @@
+"""Points and cameras of a reconstruction to turn about in a browser, as one HTML file."""
+
+from __future__ import annotations
+
+import html
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge.io import plain
+from epigauge.io._common import PathLike, check_suffix
+from epigauge.multi_view.adjust import BundleResult
+from epigauge.multi_view.display import Display, camera_spacing, display, is_sequence
+from epigauge.multi_view.tracks import Tracks
+from epigauge.reports._page import save_page
+
+__all__ = ["save_viewer"]
+
+Array = NDArray[np.float64]
+
+_PYRAMID = (0.06, 0.4)  # length of a camera, in usual distances of a point from the middle
+_DOT = (2.0, 5.5)  # diameter of a point, in pixels of the screen
+_STRAY = 0.005  # share of the points left out at either end when the view is fitted
+_FITTED = 500  # points that the view is fitted to
+
+
+def save_viewer(
+    path: PathLike,
+    result: BundleResult,
+    tracks: Tracks,
+    title: str = "",
+    *,
+    frame: Display | None = None,
+    view_numbers: ArrayLike | None = None,
+    point_numbers: ArrayLike | None = None,
+) -> None:
+    """Write points and cameras as a page to look at them from all sides.
+
+    They are shown in a basis in which they look plausible (see `multi_view.display`): that is no
+    calibration, and nothing can be measured in it. Points are coloured by their RMS residual, by
+    the number of views or by height, cameras are pyramids, and whatever is under the pointer tells
+    its numbers. The page needs no network and no other file.
+
+    Parameters
+    ----------
+    path : str or path
+        The file: ``.html``.
+    result : BundleResult
+        What `bundle_adjust` returned for these tracks.
+    tracks : Tracks
+        Observations.
+    title : str
+        What to call them.
+    frame : Display, optional
+        Where to show them; by default ``display(result.reconstruction, tracks)``.
+    view_numbers, point_numbers : array_like of int, optional
+        What to call views and points, if not by their indices.
+
+    Raises
+    ------
+    ArgumentError
+        If the suffix is another one.
+    OSError
+        If the file cannot be written.
+    """
+    check_suffix(path, ".html")
+    shown = display(result.reconstruction, tracks) if frame is None else frame
+    views = np.arange(tracks.n_views) if view_numbers is None else np.asarray(view_numbers)
+    points = np.arange(tracks.n_points) if point_numbers is None else np.asarray(point_numbers)
+    lead = (
+        f"{tracks.n_views} views, {tracks.n_points} points, {len(tracks)} observations, "
+        f"RMS {result.rms_px:.4g} px"
+    )
+    if result.loss_scale_px:
+        lead += f" (robust loss of scale {result.loss_scale_px:.2g} px)"
+    lead += ". A basis to look at, no calibration: nothing can be measured in it."
+    hidden = tracks.n_points - int(shown.shown.sum())
+    if hidden:
+        lead += f" {hidden} points far away or behind a camera are not shown."
+    parts = {
+        "title": html.escape(title or "Reconstruction"),
+        "lead": lead,
+        "warning": _warning(result, shown),
+    }
+    save_page(path, "viewer", parts, _data(shown, tracks, result.fun, views, points))
+
+
+def _warning(result: BundleResult, shown: Display) -> str:
+    said = []
+    if not result.success:
+        said.append(f"Not converged: {html.escape(result.message)}.")
+    if shown.distorted:
+        said.append(
+            "In no basis do all cameras look usual: the picture is distorted. Gross errors in the "
+            "tracks bend a reconstruction; a robust loss may help."
+        )
+    return f'<p class="warning">{" ".join(said)}</p>' if said else ""
+
+
+def _data(
+    shown: Display,
+    tracks: Tracks,
+    residuals: Array,
+    view_numbers: NDArray[Any],
+    point_numbers: NDArray[Any],
+) -> dict[str, Any]:
+    """Return what the script needs, numbers rounded to what a screen shows."""
+    squared = np.sum(residuals**2, axis=1)
+    rms = _rms(tracks.point, squared, tracks.n_points)
+    kept = shown.shown & np.isfinite(rms)
+    X = shown.points[kept]
+    counts = np.bincount(tracks.point, minlength=tracks.n_points)[kept]
+    near = _without_strays(X)
+    around = np.vstack([shown.centres, near[:: -(-max(len(near), 1) // _FITTED)]])
+    low, high = around.min(axis=0), around.max(axis=0)
+    spacing = camera_spacing(shown.centres)
+    return {
+        "points": _rounded(X.ravel(), 4),
+        "number": point_numbers[kept].tolist(),
+        "rms": _rounded(rms[kept], 4),
+        "views": counts.tolist(),
+        # The tracks are sorted by point: the views of point k are seen[first[k]:first[k + 1]].
+        "seen": tracks.view[kept[tracks.point]].tolist(),
+        "first": [0, *np.cumsum(counts).tolist()],
+        "cameras": [
+            {
+                "number": int(number),
+                "centre": _rounded(centre, 4),
+                "corners": [_rounded(corner, 4) for corner in corners],
+                "points": int(points),
+                "rms": plain(np.round(of_view, 4)),
+            }
+            for number, centre, corners, points, of_view in zip(
+                view_numbers,
+                shown.centres,
+                shown.corners,
+                np.bincount(tracks.view, minlength=tracks.n_views),
+                _rms(tracks.view, squared, tracks.n_views),
+                strict=True,
+            )
+        ],
+        "pyramid": float(np.clip(spacing, *_PYRAMID)),
+        "sequence": is_sequence(shown.centres),
+        "dot": float(np.clip(150.0 / np.sqrt(max(len(X), 1)), *_DOT)),
+        "middle": _rounded((low + high) / 2.0, 4),
+        "bounds": [_rounded(point, 3) for point in around],
+        "grid": [np.floor(low[:2]).tolist(), np.ceil(high[:2]).tolist(), float(low[2])],
+    }
+
+
+def _without_strays(X: Array) -> Array:
+    """Return points without those that are among the most outlying along an axis."""
+    if not len(X):
+        return X
+    low, high = np.quantile(X, (_STRAY, 1.0 - _STRAY), axis=0)
+    return np.asarray(X[((X >= low) & (X <= high)).all(axis=1)])
+
+
+def _rms(index: NDArray[np.intp], squared: Array, count: int) -> Array:
+    """Return the RMS residual coordinate of each point or view."""
+    total = np.bincount(index, squared, minlength=count)
+    return np.asarray(np.sqrt(total / (2.0 * np.bincount(index, minlength=count))))
+
+
+def _rounded(values: Array, decimals: int) -> list[float]:
+    rounded: list[float] = np.round(values, decimals).tolist()
+    return rounded
