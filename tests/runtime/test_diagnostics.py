@@ -125,12 +125,14 @@ class TestParts:
         h = H @ homogeneous(q1.T).T
         q2 = h[:2] / h[2]
         weights = np.ones(60)
-        G, cost, _ = fit_homography(q1, q2, weights)
+        G, squares, _ = fit_homography(q1, q2, weights)
+        cost = float(weights @ squares)
         np.testing.assert_allclose(G / G[2, 2], H, rtol=0, atol=1e-9)
         assert cost < 1e-20
         noise = 1e-3
         noisy = [q + noise * rng.standard_normal(q.shape) for q in (q1, q2)]
-        _, cost, _ = fit_homography(*noisy, weights)
+        _, squares, _ = fit_homography(*noisy, weights)
+        cost = float(weights @ squares)
         # chi-square with 2 * 60 - 8 degrees of freedom: 112, deviation 15
         assert cost / noise**2 == pytest.approx(112, abs=45)
 

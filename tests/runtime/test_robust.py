@@ -11,6 +11,7 @@ from epigauge import kernels
 from epigauge.errors import MissingPackageError
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.consensus import Consensus
+from epigauge.two_view.diagnostics import _by_chance
 from two_views import same_geometry
 
 INSTALLED = [
@@ -262,3 +263,41 @@ def test_threshold_that_leaves_fewer_than_eight_inliers_is_refused():
     _, x1, x2, _ = spoilt(0, m=20)
     with pytest.raises(eg.ArgumentError, match="agree on no epipolar geometry"):
         eg.estimate_fundamental(x1, x2, threshold_px=1e-9)
+
+
+@front_end
+class TestPlanesWithWrongMatches:
+    """A few wrong matches always fit an F through a homography; they must not hide the plane."""
+
+    K = np.array([[800.0, 0.0, 320.0], [0.0, 800.0, 240.0], [0.0, 0.0, 1.0]])
+    ROTATION = np.array([[np.cos(0.1), 0, np.sin(0.1)], [0, 1, 0], [-np.sin(0.1), 0, np.cos(0.1)]])
+    PLANE = np.array([[1.1, 0.1, 3.0], [-0.1, 0.95, 20.0], [1e-4, -2e-4, 1.0]])
+
+    def flags(self, H, wrong, depth=0.0, seed=0):
+        """Return the flags of 200 matches by a homography, some wrong, some off the plane."""
+        rng = np.random.default_rng(seed)
+        x1 = rng.uniform((0, 0), (640, 480), (200, 2))
+        x2 = np.column_stack([x1, np.ones(200)]) @ H.T
+        x2 = x2[:, :2] / x2[:, 2:]
+        x2[:60] += depth * rng.uniform(0, 1, (60, 1)) * ([900.0, 200.0] - x2[:60])
+        x1, x2 = (x + 0.5 * rng.standard_normal(x.shape) for x in (x1, x2))
+        x2[200 - wrong :] = rng.uniform((0, 0), (640, 480), (wrong, 2))
+        return eg.estimate_fundamental(x1, x2).flags
+
+    @pytest.mark.parametrize("wrong", [0, 40])
+    @pytest.mark.parametrize("seed", [0, 1])
+    def test_plane_is_flagged(self, wrong, seed) -> None:
+        assert self.flags(self.PLANE, wrong, seed=seed) == ("planar scene",)
+
+    def test_rotation_is_flagged(self) -> None:
+        H = self.K @ self.ROTATION @ np.linalg.inv(self.K)
+        assert self.flags(H, 40) == ("planar scene", "pure rotation")
+
+    def test_true_matches_off_the_plane_are_believed(self) -> None:
+        assert "planar scene" not in self.flags(self.PLANE, 40, depth=0.1)
+
+    def test_two_wrong_matches_fit_without_any_chance(self) -> None:
+        assert [_by_chance(wrong, 0.0) for wrong in (0, 1, 2, 30)] == [0, 1, 2, 2]
+
+    def test_number_by_chance_grows_with_wrong_matches_and_chance(self) -> None:
+        assert _by_chance(30, 0.005) < _by_chance(300, 0.005) < _by_chance(300, 0.05) < 300

@@ -23,13 +23,13 @@ from epigauge.two_view.eliminated import EliminatedProblem
 from epigauge.two_view.losses import Mixture
 from epigauge.two_view.parameterizations import Block
 
-__all__ = ["Agreement", "Consensus"]
+__all__ = ["RANGE", "Agreement", "Consensus"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 #: Range of a uniform coordinate with the RMS of conditioned ones.
-_RANGE = 12.0**0.5 * RMS
+RANGE = 12.0**0.5 * RMS
 
 #: Standard deviation of the noise, conditioned, below which distances are rounding.
 _FLOOR = 1e-12
@@ -81,7 +81,7 @@ class Agreement:
     @property
     def mixture(self) -> Mixture:
         """Return the density of the distances."""
-        return Mixture.of(self.sigma, self.share, _RANGE)
+        return Mixture.of(self.sigma, self.share, RANGE)
 
     def inliers(self, limit: float) -> Mask:
         """Return which matches are oriented and within a distance."""
@@ -114,10 +114,10 @@ class Consensus:
         squared = signed**2
         best = None
         while True:
-            mixture = Mixture.of(sigma, share, _RANGE)
-            wrong = np.log((1.0 - share) / _RANGE)
+            mixture = Mixture.of(sigma, share, RANGE)
+            wrong = np.log((1.0 - share) / RANGE)
             logs = np.where(oriented, mixture.logarithm(squared), wrong)
-            score = float(np.sum(logs)) - 7.0 * float(np.log(_RANGE / sigma))
+            score = float(np.sum(logs)) - 7.0 * float(np.log(RANGE / sigma))
             if best is not None and score <= best.score + _CLIMBED:
                 return best
             best = Agreement(F, signed, oriented, sigma, share, score)

@@ -6,7 +6,7 @@ answered here by comparing simpler models with it, and by the size of its covari
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +16,15 @@ from epigauge.two_view.covariance import residual_noise
 from epigauge.two_view.criteria import Reprojection
 from epigauge.two_view.solve import Matches, Options, Solution
 
-__all__ = ["FLAGS", "Evidence", "diagnose", "evidence", "fit_homography", "is_oriented"]
+__all__ = [
+    "FLAGS",
+    "Evidence",
+    "diagnose",
+    "evidence",
+    "fit_homography",
+    "is_oriented",
+    "without_chance_matches",
+]
 
 Array = NDArray[np.float64]
 
@@ -59,6 +67,11 @@ _AFFINE = 11.34
 
 #: Standard deviations that count as within the noise.
 _WITHIN = 3.0
+
+#: Iterations of the robust homography, and the distance from it in standard deviations of the noise
+#: beyond which a match is off the plane: one right match in a hundred thousand.
+_ROBUST_ROUNDS = 20
+_OFF_PLANE = 5.0
 
 #: A noise below this, in conditioned coordinates, is rounding.
 _ROUNDING = 1e-8
@@ -174,7 +187,8 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     raised = {"ambiguous": ambiguous, "not oriented": not found.oriented}
     n, p, noise2 = len(found.squared), found.parameters, max(found.noise, _ROUNDING) ** 2
     S = float(np.sum(found.weights * found.squared))
-    H, S_H, N_H = fit_homography(found.q1, found.q2, found.weights)
+    H, squares, N_H = fit_homography(found.q1, found.q2, found.weights)
+    S_H = float(found.weights @ squares)
     ratio = max(_AIC_RATIO, _variance_ratio_99(2 * n - 8, max(n - p, 4)))
     raised["planar scene"] = (2 * n - 8) * ratio * noise2 >= S_H
     raised["pure rotation"] = raised["planar scene"] and _may_be_rotation(found, H, N_H)
@@ -182,6 +196,69 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     raised["weak geometry"] = not deviation <= _WEAK
     raised["few matches"] = n - p < _REDUNDANCY
     return tuple(name for name in FLAGS if raised[name])
+
+
+def without_chance_matches(found: Evidence, rejected: int, chance: float) -> Evidence:
+    """Leave out matches off a plane that are no more than wrong ones agree with F by chance.
+
+    An F that fits a homography is free to move its epipole, and so to explain two wrong matches
+    more; of the others, some lie by chance on their epipolar lines. A few such matches would hide
+    that all the rest are in one plane [1]_.
+
+    Parameters
+    ----------
+    found : Evidence
+        Solution and inliers.
+    rejected : int
+        Number of matches that do not agree with F.
+    chance : float
+        Probability that a wrong match agrees.
+
+    Returns
+    -------
+    Evidence
+        Without the matches off the plane, where these are no more than `_by_chance` says; else as
+        it was.
+
+    References
+    ----------
+    .. [1] O. Chum, T. Werner, J. Matas, "Two-view geometry estimation unaffected by a dominant
+       plane", CVPR 2005.
+    """
+    weights = found.weights
+    for _ in range(_ROBUST_ROUNDS):
+        _, squares, _ = fit_homography(found.q1, found.q2, weights)
+        scale2 = max(float(np.median(squares)), _ROUNDING**2)
+        weights = found.weights / (1.0 + squares / scale2) ** 2
+    on = found.weights * squares <= (_OFF_PLANE * max(found.noise, _ROUNDING)) ** 2
+    off = int(np.count_nonzero(~on))
+    if off == 0 or off > _by_chance(rejected + off, chance):
+        return found
+    return replace(
+        found,
+        q1=found.q1[:, on],
+        q2=found.q2[:, on],
+        q1_hat=found.q1_hat[:, on],
+        q2_hat=found.q2_hat[:, on],
+        weights=found.weights[on],
+        squared=found.squared[on],
+    )
+
+
+def _by_chance(wrong: int, chance: float) -> int:
+    """Return how many of some wrong matches may agree with an F that a homography leaves free.
+
+    Two, through which the epipole is put, and as many more as the best of all pairs finds with
+    99 %: the least q with ``choose(wrong, 2) P(Poisson(wrong chance) > q) <= 0.01``.
+    """
+    pairs, mean = wrong * (wrong - 1) / 2, min(wrong * chance, 700.0)
+    q, term = 0, float(np.exp(-mean))
+    tail = 1.0 - term
+    while pairs * tail > 0.01 and q < wrong:
+        q += 1
+        term *= mean / q
+        tail -= term
+    return min(2 + q, wrong)
 
 
 def is_oriented(F: Array, q1_hat: Array, q2_hat: Array, noise: float) -> bool:
@@ -222,7 +299,7 @@ def is_oriented(F: Array, q1_hat: Array, q2_hat: Array, noise: float) -> bool:
     return bool((signs > 0.0).all() or (signs < 0.0).all())
 
 
-def fit_homography(q1: Array, q2: Array, weights: Array) -> tuple[Array, float, Array]:
+def fit_homography(q1: Array, q2: Array, weights: Array) -> tuple[Array, Array, Array]:
     """Fit q2 ~ H q1 by Sampson's weights: the reprojection error to first order.
 
     Parameters
@@ -236,8 +313,8 @@ def fit_homography(q1: Array, q2: Array, weights: Array) -> tuple[Array, float, 
     -------
     H : ndarray, shape (3, 3)
         Homography of unit Frobenius norm.
-    cost : float
-        Weighted sum of squared distances in both images.
+    squares : ndarray, shape (n,)
+        Squared distance of each match, in both images.
     N : ndarray, shape (9, 9)
         J^T J by vect(H).
     """
@@ -256,8 +333,7 @@ def fit_homography(q1: Array, q2: Array, weights: Array) -> tuple[Array, float, 
         squares = J1 @ J1.transpose(0, 2, 1) + depth[:, None, None] ** 2 * np.eye(2)
         inverse = np.linalg.inv(squares + np.finfo(float).tiny * np.eye(2))
     c = A @ H.ravel()
-    cost = float(np.einsum("n,ni,nij,nj->", weights, c, inverse, c))
-    return H, cost, N
+    return H, np.einsum("ni,nij,nj->n", c, inverse, c), N
 
 
 def _variance_ratio_99(above: int, below: int) -> float:

@@ -150,7 +150,9 @@ class FundamentalResult(Partial):
         Names from `epigauge.two_view.diagnostics.FLAGS`, which explains them; the tests are in
         `epigauge.two_view.diagnostics.diagnose`. They use the noise of the residuals.
         """
-        found = self._evidence
+        return self._flags(self._evidence)
+
+    def _flags(self, found: Evidence) -> tuple[str, ...]:
         estimated_px = found.noise / found.to_units1[0, 0]
         deviation = self._uncertainty.largest() * estimated_px / self.noise_px
         return diagnose(found, deviation, self.ambiguous)

@@ -7,6 +7,7 @@ import importlib.util
 import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,8 @@ from epigauge import kernels
 from epigauge._arguments import as_choice, as_count, as_matches, as_positive
 from epigauge.errors import ArgumentError, MissingPackageError
 from epigauge.two_view.conditioning import RMS, condition
-from epigauge.two_view.consensus import Agreement, Consensus
+from epigauge.two_view.consensus import RANGE, Agreement, Consensus
+from epigauge.two_view.diagnostics import without_chance_matches
 from epigauge.two_view.initial import fundamental_8point
 from epigauge.two_view.losses import robust_scale
 from epigauge.two_view.refine import refine_fundamental
@@ -69,6 +71,14 @@ class RobustResult(FundamentalResult):
     threshold_px: float
     rounds: int
     start: str
+
+    @cached_property
+    def flags(self) -> tuple[str, ...]:
+        """As `FundamentalResult.flags`, robust against wrong matches that agree by chance."""
+        rejected = len(self.inlier) - int(np.count_nonzero(self.inlier))
+        # Wrong distances are taken as uniform over the range of the coordinates.
+        chance = min(2.0 * self.threshold_px * self._evidence.to_units1[0, 0] / RANGE, 1.0)
+        return self._flags(without_chance_matches(self._evidence, rejected, chance))
 
 
 def estimate_fundamental(
