@@ -45,9 +45,8 @@ types: $(STAMPS)/tox ## mypy --strict
 bench: $(STAMPS)/package ## time the solvers (not part of the tests)
 	$(BIN)/python benchmarks/run.py
 
-docs: $(STAMPS)/docs ## build docs/*.md into docs/_build/
-	$(BIN)/python -m sphinx -q -C -b html -D extensions=myst_parser -D project=epigauge \
-	    -D exclude_patterns=_build docs docs/_build
+docs: $(STAMPS)/docs ## build the documentation into docs/_build/
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build
 	@echo "Open docs/_build/index.html"
 
 clean: ## remove environments, builds and caches
@@ -72,6 +71,6 @@ $(STAMPS)/derive: $(STAMPS)/venv pyproject.toml
 	$(PIP) install $$($(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["derive"])')
 	@touch $@
 
-$(STAMPS)/docs: $(STAMPS)/venv
-	$(PIP) install sphinx myst-parser
+$(STAMPS)/docs: $(STAMPS)/venv $(SOURCES)
+	$(PIP) install '.[docs]'
 	@touch $@

@@ -5,8 +5,9 @@
 >>> result.F, result.rms_px, result.covariance  # doctest: +SKIP
 """
 
-from epigauge import casadi, kernels
+from epigauge import casadi, colmap, datasets, interop, kernels
 from epigauge.errors import ArgumentError, BackendError, EpigaugeError, FileFormatError
+from epigauge.images import ImageMatches, load_image, match_images
 from epigauge.io import (
     Matches,
     load_matches,
@@ -49,6 +50,7 @@ __all__ = [
     "FileFormatError",
     "FundamentalBatch",
     "FundamentalResult",
+    "ImageMatches",
     "Matches",
     "MultiViewScene",
     "Reconstruction",
@@ -60,17 +62,22 @@ __all__ = [
     "bundle_adjust",
     "canonical_cameras",
     "casadi",
+    "colmap",
     "compare",
     "covariance",
+    "datasets",
     "estimate_fundamental",
     "fundamental_7point",
     "fundamental_8point",
     "gauge",
     "initialize",
+    "interop",
     "kernels",
+    "load_image",
     "load_matches",
     "load_reconstruction",
     "load_tracks",
+    "match_images",
     "multi_view_scene",
     "refine_fundamental",
     "refine_fundamental_batch",

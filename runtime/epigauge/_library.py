@@ -15,7 +15,7 @@ from epigauge_generated.signatures import C_DIGEST
 
 from epigauge.errors import ArgumentError, BackendError
 
-__all__ = ["LEVELS", "library", "variant"]
+__all__ = ["LEVELS", "library", "usable", "variant"]
 
 #: Names of the variants by the level of the x86-64 ABI they need, the fastest first.
 LEVELS = {4: "x86-64-v4", 3: "x86-64-v3", 0: "baseline"}
@@ -48,23 +48,34 @@ def variant() -> str:
     return _choose()[0]
 
 
+def usable() -> tuple[str, ...]:
+    """Return the names of the variants that were built and that the processor can run."""
+    return tuple(_usable(_files())[1])
+
+
 @cache
 def _choose() -> tuple[str, ctypes.CDLL]:
     files = _files()
+    baseline, levels = _usable(files)
+    wanted = os.environ.get(CHOICE)
+    if wanted and wanted not in levels:
+        raise ArgumentError(CHOICE, f"is {wanted!r}", f"one of {', '.join(levels)}, or unset")
+    name = wanted or next(iter(levels))
+    level = levels[name]
+    return name, _loaded(files[_suffix(level)]) if level else baseline
+
+
+def _usable(files: dict[str, str]) -> tuple[ctypes.CDLL, dict[str, int]]:
+    """Return the baseline library, and the levels of all usable ones by name, the fastest first."""
     if "" not in files:
         remedy = "install a C compiler, then epigauge again"
         raise BackendError("c", "was not built when epigauge was installed", remedy)
     baseline = _loaded(files[""])
     able = int(baseline.eg_processor_level())
-    usable = {
+    levels = {
         name: level for level, name in LEVELS.items() if level <= able and _suffix(level) in files
     }
-    wanted = os.environ.get(CHOICE)
-    if wanted and wanted not in usable:
-        raise ArgumentError(CHOICE, f"is {wanted!r}", f"one of {', '.join(usable)}, or unset")
-    name = wanted or next(iter(usable))
-    level = usable[name]
-    return name, _loaded(files[_suffix(level)]) if level else baseline
+    return baseline, levels
 
 
 def _suffix(level: int) -> str:

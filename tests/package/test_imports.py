@@ -11,7 +11,10 @@ from pathlib import Path
 import pytest
 
 CHECKOUT = Path(__file__).resolve().parents[2]
-OPTIONAL = {"sympy", "casadi", "matplotlib", "typer", "rich", "cv2", "epigauge_derive"}
+OPTIONAL = {
+    *("casadi", "cv2", "matplotlib", "pooch", "requests", "rich", "scipy", "sympy", "typer"),
+    "epigauge_derive",
+}
 
 
 def imported(tree: ast.AST, *, inside_functions: bool = True) -> Iterator[str]:

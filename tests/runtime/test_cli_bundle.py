@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from pathlib import Path
 
@@ -14,7 +15,9 @@ pytest.importorskip("typer", reason="the command line needs typer")
 pytest.importorskip("rich", reason="the command line needs rich")
 
 from epigauge.__main__ import main
+from epigauge.multi_view.display import Display, display
 from rich.console import Console
+from rich.progress import Progress
 
 SCENE = eg.multi_view_scene(n_points=30, distance=4.0, seed=4)
 RESULT = eg.bundle_adjust(SCENE.tracks)
@@ -109,10 +112,63 @@ def test_cloud_holds_points_and_cameras(run, file, tmp_path) -> None:
 
 def test_pictures_are_drawn(run, file, tmp_path) -> None:
     pytest.importorskip("matplotlib", reason="pictures need matplotlib")
-    run("bundle", file, "--plot", tmp_path / "b.png")
+    run("bundle", file, "--plot", tmp_path / "b.png", "--plot", tmp_path / "b.html")
     run("compare", file, "--methods", "free,covariant", "--plot", tmp_path / "c.svg")
     assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
+    assert "5 views, 30 points" in (tmp_path / "b.html").read_text()
     assert "<svg" in (tmp_path / "c.svg").read_text()
+
+
+def test_several_files_are_written_in_one_run(run, file, tmp_path) -> None:
+    code, _, err = run(
+        *("bundle", file, "-o", tmp_path / "r.npz", "-o", tmp_path / "c.ply"),
+        *("--colmap", tmp_path / "model", "--plot", tmp_path / "v.html"),
+    )
+    assert code == 0
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *("tracks.npz", "r.npz", "c.ply", "v.html", "model")
+    }
+    assert "by pinhole cameras" in err
+    assert "no calibration" in " ".join(err.split())
+    images = (tmp_path / "model" / "images.txt").read_text().splitlines()
+    assert images[5].endswith(" 1 view0000")
+
+
+def test_reconstruction_like_no_pinhole_cameras_is_refused_after_all_else(
+    run, file, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr("epigauge.multi_view.pinhole._UNUSUAL", 0.0)
+    code, out, err = run("bundle", file, "-o", tmp_path / "r.npz", "--colmap", tmp_path / "model")
+    assert code == 2
+    assert len(out.splitlines()) == 5
+    assert (tmp_path / "r.npz").exists()
+    assert not (tmp_path / "model").exists()
+    assert "no basis in which its cameras look like pinhole cameras" in " ".join(err.split())
+
+
+@pytest.mark.parametrize(
+    ("suffix", "options", "y_up"),
+    [
+        (".npz", [], False),
+        (".npz", ["--y-up"], True),
+        (".txt", [], True),
+        (".txt", ["--y-down"], False),
+    ],
+)
+def test_images_of_bal_files_have_y_up(run, tmp_path, monkeypatch, suffix, options, y_up) -> None:
+    told = []
+
+    def spy(*arguments: object, y_up: bool) -> Display:
+        told.append(y_up)
+        return display(*arguments, y_up=y_up)
+
+    monkeypatch.setattr(sys.modules["epigauge.cli.bundle"], "display", spy)
+    tracks = eg.Tracks(SCENE.tracks.view, SCENE.tracks.point, -SCENE.tracks.xy)
+    start = eg.Reconstruction(np.diag([-1.0, -1.0, 1.0]) @ SCENE.true.P, SCENE.true.Q)
+    path = tmp_path / f"t{suffix}"
+    eg.save_tracks(path, tracks, *([start] if suffix == ".txt" else []))
+    assert run("bundle", path, "-o", tmp_path / "c.ply", *options)[0] == 0
+    assert told == [y_up]
 
 
 def test_only_clean_points_are_used_and_keep_their_numbers(run, tmp_path) -> None:
@@ -133,25 +189,113 @@ def test_a_run_that_does_not_converge_exits_1_and_still_answers(run, file) -> No
 
 def test_progress_is_shown_on_a_terminal_only(run, file, monkeypatch) -> None:
     shown = []
-    real = Console.status
+    real = Progress.update
 
-    def status(self, text, **options):
-        found = real(self, text, **options)
-        update = found.update
-        found.update = lambda text: (shown.append(text), update(text))
-        return found
+    def update(self, task, **options):
+        shown.append(options["description"])
+        return real(self, task, **options)
 
-    monkeypatch.setattr(Console, "status", status)
+    monkeypatch.setattr(Progress, "update", update)
     run("bundle", file)
     assert shown == []
     monkeypatch.setattr(Console, "is_terminal", property(lambda self: True))
+    assert document(run("bundle", file, "--json")[1])["nfev"] == RESULT.nfev
+    assert shown == []
     code, out, _ = run("bundle", file)
     assert code == 0
     assert len(out.splitlines()) == 5
-    assert len(shown) == RESULT.nfev
-    assert shown[-1].startswith(f"evaluation {RESULT.nfev}: RMS ")
-    # The last trial is as good as the best but for the tolerance of the stopping rule.
-    assert float(shown[-1].split()[-2]) == pytest.approx(RESULT.rms_px, rel=1e-5)
+    assert len(shown) == 1 + RESULT.nfev
+    best = np.inf
+    for number, (text, row) in enumerate(zip(shown[1:], RESULT.history, strict=True), 1):
+        best = min(best, row.cost)
+        rms = np.sqrt(best / len(SCENE.tracks))
+        words = f"evaluation {number}  RMS {rms:.6f} px  cost {best:.8g} px\N{SUPERSCRIPT TWO}"
+        assert text.startswith(words)
+    shown.clear()
+    run("compare", file, "--methods", "free,covariant")
+    assert shown[0].startswith("free: evaluation 1")
+    assert shown[-1].startswith(f"covariant: evaluation {RESULT.nfev}  RMS {RESULT.rms_px:.6f} px")
+
+
+# Ctrl-C
+
+
+@pytest.fixture
+def pressed(monkeypatch):
+    """Press Ctrl-C during some evaluations of every adjustment."""
+
+    def press(*evaluations: int) -> None:
+        real = eg.bundle_adjust
+
+        def adjust(*arguments, callback, **options):
+            def watched(row):
+                stop = callback(row)
+                for _ in range(evaluations.count(row.iteration)):
+                    signal.raise_signal(signal.SIGINT)
+                return stop
+
+            return real(*arguments, callback=watched, **options)
+
+        monkeypatch.setattr(eg, "bundle_adjust", adjust)
+        monkeypatch.setattr("epigauge.multi_view.compare.bundle_adjust", adjust)
+
+    before = signal.getsignal(signal.SIGINT)
+    yield press
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_interrupted_run_reports_and_saves_the_best_so_far(run, file, tmp_path, pressed) -> None:
+    pressed(1)
+    code, out, err = run("bundle", file, "-o", tmp_path / "r.npz")
+    assert code == 130
+    assert "interrupted after 3 evaluations" in err
+    P = np.loadtxt(out.splitlines()).reshape(-1, 3, 4)
+    with np.load(tmp_path / "r.npz", allow_pickle=False) as saved:
+        np.testing.assert_array_equal(saved["P"], P)
+        assert saved["cost"] == min(row.cost for row in RESULT.history[:3])
+        assert len(saved["history_cost"]) == 3
+    code, out, err = run("bundle", file, "--json")
+    assert (code, document(out)["nfev"]) == (130, 3)
+
+
+def test_interrupted_comparison_reports_what_was_done(run, file, pressed) -> None:
+    pressed(2)
+    code, out, err = run("compare", file, "--methods", "free,covariant,bartoli", "--json")
+    assert code == 130
+    assert [row["method"] for row in document(out)["rows"]] == ["free"]
+    assert "interrupted at free" in err
+
+
+def test_second_interrupt_ends_at_once_and_writes_nothing(run, file, tmp_path, pressed) -> None:
+    pressed(1, 1)
+    code, out, err = run("bundle", file, "-o", tmp_path / "r.npz")
+    assert (code, out) == (130, "")
+    assert err == "epigauge: interrupted; no file is left half-written\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["tracks.npz"]
+
+
+def test_interrupt_before_there_is_an_estimate_ends_at_once(
+    run, file, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(eg, "initialize", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    code, out, err = run("bundle", file, "-o", tmp_path / "r.npz")
+    assert (code, out) == (130, "")
+    assert "interrupted" in err
+    assert [path.name for path in tmp_path.iterdir()] == ["tracks.npz"]
+
+
+@pytest.mark.parametrize("name", ["r.npz", "c.ply", "b.svg", "v.html"])
+def test_interrupt_while_writing_leaves_the_old_file(
+    run, file, tmp_path, monkeypatch, name
+) -> None:
+    if name == "b.svg":
+        pytest.importorskip("matplotlib", reason="pictures need matplotlib")
+    (tmp_path / name).write_text("old")
+    monkeypatch.setattr(Path, "replace", lambda *_: signal.raise_signal(signal.SIGINT))
+    option = "--plot" if name in ("b.svg", "v.html") else "-o"
+    assert run("bundle", file, option, tmp_path / name)[0] == 130
+    assert {path.name for path in tmp_path.iterdir()} == {"tracks.npz", name}
+    assert (tmp_path / name).read_text() == "old"
 
 
 # compare
@@ -209,6 +353,8 @@ def test_a_bad_file_is_one_clear_line_and_exit_2(
         (["--clean"], "marks nothing as clean"),
         (["--plot", "b.pdf"], "b.pdf"),
         (["-o", "r.json"], "r.json"),
+        (["-o", "absent/r.npz"], "absent: No such file or directory"),
+        (["--plot", "absent/r.html"], "absent: No such file or directory"),
         (["--start", "absent.npz"], "absent.npz: No such file"),
     ],
 )
@@ -217,6 +363,15 @@ def test_bad_options_are_one_clear_line_and_exit_2(run, file, options, words) ->
     assert (code, out) == (2, "")
     assert words in err
     assert err.count("\n") == 1
+
+
+def test_missing_matplotlib_is_noticed_before_the_work(run, file, tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setattr(eg, "bundle_adjust", pytest.fail)
+    for command in ("bundle", "compare"):
+        code, _, err = run(command, file, "--plot", tmp_path / "b.png")
+        assert code == 2
+        assert "pip install 'epigauge[plot]'" in err
 
 
 def test_start_of_another_size_is_refused(run, file, tmp_path) -> None:

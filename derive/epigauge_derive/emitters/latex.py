@@ -43,7 +43,9 @@ def _equations(assignments: Assignments, arrow: str = "=") -> list[str]:
 
 
 def _entry(name: str, index: tuple[int, ...], summed: bool) -> str:
-    subscript = "".join(str(position + 1) for position in index)
+    # Two-digit positions are told apart by a comma.
+    separator = "," if any(position >= 9 for position in index) else ""
+    subscript = separator.join(str(position + 1) for position in index)
     text = rf"\mathtt{{{name.replace('_', chr(92) + '_')}}}"
     text += f"_{{{subscript}}}" if subscript else ""
     return text + (r" &= \sum" if summed else " &=")

@@ -13,9 +13,12 @@ import typer
 import epigauge as eg
 from epigauge.cli._common import command
 from epigauge.cli.bundle import bundle
+from epigauge.cli.colmap import colmap
 from epigauge.cli.compare import compare
+from epigauge.cli.data import data
 from epigauge.cli.demo import demo
 from epigauge.cli.info import info
+from epigauge.cli.pair import pair
 from epigauge.cli.refine import refine
 from epigauge.cli.reproduce import reproduce
 
@@ -48,5 +51,5 @@ def _main(
     """
 
 
-for _function in (demo, refine, bundle, compare, info, reproduce):
+for _function in (demo, refine, pair, bundle, compare, colmap, data, info, reproduce):
     app.command()(command(_function))

@@ -20,6 +20,8 @@ from epigauge.io import plain
 P = ParamSpec("P")
 
 DONE, NOT_CONVERGED, BAD_INPUT = 0, 1, 2
+#: What a shell reports of a program that Ctrl-C has ended.
+INTERRUPTED = 130
 
 Json = Annotated[bool, typer.Option("--json", help="Write one JSON document to stdout.")]
 
@@ -27,8 +29,8 @@ Json = Annotated[bool, typer.Option("--json", help="Write one JSON document to s
 def command(function: Callable[P, int]) -> Callable[P, None]:
     """Make a command of a function that returns its exit code.
 
-    Errors of epigauge and of the operating system end it with `BAD_INPUT` and one line on stderr;
-    anything else is a bug and keeps its traceback.
+    Errors of epigauge and of the operating system end it with `BAD_INPUT` and one line on stderr,
+    Ctrl-C with `INTERRUPTED`; anything else is a bug and keeps its traceback.
     """
 
     @functools.wraps(function)
@@ -43,6 +45,9 @@ def command(function: Callable[P, int]) -> Callable[P, None]:
         except (EpigaugeError, OSError) as error:
             typer.echo(f"epigauge: {_one_line(error)}", err=True)
             raise typer.Exit(BAD_INPUT) from None
+        except KeyboardInterrupt:
+            typer.echo("epigauge: interrupted; no file is left half-written", err=True)
+            raise typer.Exit(INTERRUPTED) from None
         raise typer.Exit(code)
 
     return run

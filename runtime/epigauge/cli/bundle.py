@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,24 +15,37 @@ from rich.console import Console
 from rich.markup import escape
 
 import epigauge as eg
-from epigauge import lm
 from epigauge._arguments import as_choice
-from epigauge.cli._common import DONE, NOT_CONVERGED, Json, console, facts, shown, write_json
+from epigauge.cli._common import (
+    DONE,
+    INTERRUPTED,
+    NOT_CONVERGED,
+    Json,
+    console,
+    facts,
+    shown,
+    write_json,
+)
+from epigauge.cli._live import watching
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import (
     TrackFile,
     load_reconstruction,
     load_track_file,
     plain,
+    save_colmap_model,
     save_ply,
     save_result,
 )
 from epigauge.io._common import check_suffix
 from epigauge.io.tracks import arrays_of
-from epigauge.multi_view.display import display
+from epigauge.multi_view.display import Display, display
+from epigauge.multi_view.pinhole import PinholeModel, pinhole_model
 
 _GAUGES = ("reference_camera", "two_cameras", "five_points", "normalized")
 _POINT, _CAMERA = (90, 140, 190), (224, 122, 31)
+#: Tracks in these files have y down, those of BAL problems y up.
+_Y_DOWN = (".npz", ".csv")
 
 Clean = Annotated[bool, typer.Option("--clean", help="Use only what the file marks as clean.")]
 MaxIter = Annotated[int, typer.Option(help="Trial steps allowed.")]
@@ -58,10 +72,25 @@ def bundle(
     max_iter: MaxIter = 100,
     start: Start = None,
     backend: Backend = None,
-    plot: Annotated[Path | None, typer.Option(help="Draw a picture: PNG or SVG.")] = None,
+    plot: Annotated[
+        list[Path] | None,
+        typer.Option(help="Draw a picture: PNG or SVG; or write a page to turn it: HTML."),
+    ] = None,
     output: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option("--output", "-o", help="NPZ: everything. PLY: a cloud to look at."),
+    ] = None,
+    colmap: Annotated[
+        Path | None, typer.Option(help="Directory for a COLMAP text model with pinhole cameras.")
+    ] = None,
+    y_up: Annotated[
+        bool | None,
+        typer.Option(
+            "--y-up/--y-down",
+            help="Where y points in the images: up in BAL files, else down. Else what is drawn is "
+            "mirrored.",
+            show_default=False,
+        ),
     ] = None,
     json: Json = False,
 ) -> int:
@@ -70,21 +99,28 @@ def bundle(
     Starts from two views, registers the others in turn, and minimises the
     reprojection error in a projective basis. Writes the cameras to stdout, one
     line of 12 numbers each, row by row; with --json everything known.
+    --plot and -o may be given several times.
 
-    PLY and pictures use a basis in which the scene looks plausible: that is no
-    calibration, and nothing can be measured in it.
+    Pictures, PLY and COLMAP models use a basis in which the scene looks
+    plausible: that is no calibration, and nothing can be measured in it.
+
+    Ctrl-C stops after the evaluation being done: the best estimate so far is
+    reported and saved as asked, with exit code 130.
     """
-    if plot is not None:
-        check_suffix(plot, ".png", ".svg")
-    if output is not None:
-        check_suffix(output, ".npz", ".ply")
+    plots, outputs = plot or [], output or []
+    for path in plots:
+        check_target(path, ".png", ".svg", ".html")
+    for path in outputs:
+        check_target(path, ".npz", ".ply")
     out = console()
     file = load_track_file(tracks, clean)
     begin = time.perf_counter()
-    with progress(out, file.tracks, not json) as callback:
+    with watching(out, len(file.tracks), "first reconstruction", not json) as watch:
+        first = first_reconstruction(file, tracks, start, backend)
+        watch.begin()
         result = eg.bundle_adjust(
             file.tracks,
-            first_reconstruction(file, tracks, start, backend),
+            first,
             method=method,
             damping=damping,
             gauge=gauge_named(gauge),
@@ -92,31 +128,46 @@ def bundle(
             loss=loss,
             max_iter=max_iter,
             backend=backend,
-            callback=callback,
+            callback=watch,
         )
     seconds = time.perf_counter() - begin
 
-    more = {
-        "source": str(tracks),
-        "n_views": file.tracks.n_views,
-        "n_points": file.tracks.n_points,
-        "view_numbers": file.views,
-        "point_numbers": file.points,
-        "seconds": seconds,
-    }
-    if output is not None:
-        _save(output, result, file.tracks, more)
-    if plot is not None:
-        _draw(plot, result, file.tracks, tracks)
+    if y_up is None:
+        y_up = tracks.suffix.lower() not in _Y_DOWN
+    answer = _Answer(result, file, tracks, y_up, seconds)
+    for path in outputs:
+        answer.save(path)
+    for path in plots:
+        answer.draw(path)
+    refused = None if colmap is None else answer.save_colmap(colmap)
     if json:
-        document = plain(result)
-        document |= document.pop("reconstruction")
-        write_json(document | more)
+        write_json(answer.document())
     else:
-        _report(out, result, file.tracks, tracks, seconds)
+        answer.report(out, watch.interrupted)
         for P in result.reconstruction.P:
             typer.echo(" ".join(f"{value:.17g}" for value in P.ravel()))
+    if watch.interrupted:
+        out.print(f"[bold red]interrupted[/] after {result.nfev} evaluations: this is the best")
+        return INTERRUPTED
+    if refused is not None:
+        raise refused
     return DONE if result.success else NOT_CONVERGED
+
+
+def check_target(path: Path, *suffixes: str) -> None:
+    """Check what a run that may be long will write, before it starts."""
+    suffix = check_suffix(path, *suffixes)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
+    if suffix in (".png", ".svg"):
+        from epigauge.plots._style import need_matplotlib
+
+        need_matplotlib()
+
+
+def named(path: Path) -> str:
+    """Return what to call a file in a picture: its name and that of its directory."""
+    return shown(Path(*path.parts[-2:]))
 
 
 def first_reconstruction(
@@ -143,75 +194,101 @@ def gauge_named(name: str | None) -> eg.gauge.Gauge | None:
     return gauge
 
 
-@contextmanager
-def progress(
-    out: Console, tracks: eg.Tracks, wanted: bool = True
-) -> Iterator[Callable[[lm.Row], None] | None]:
-    """Show on one line of a terminal what the adjustment is at.
+class _Answer:
+    """A result and the forms it is given in."""
 
-    Parameters
-    ----------
-    out : Console
-        For people; where it is no terminal nothing is shown.
-    tracks : Tracks
-        Observations, whose number makes an RMS of a cost (robust and weighted, if the cost is).
-    wanted : bool
-        Whether to show anything.
+    def __init__(
+        self, result: eg.BundleResult, file: TrackFile, source: Path, y_up: bool, seconds: float
+    ) -> None:
+        self.result, self.file, self.source = result, file, source
+        self.y_up, self.seconds = y_up, seconds
+        self.model: PinholeModel | None = None
 
-    Yields
-    ------
-    callable or None
-        Callback of `bundle_adjust`.
-    """
-    if not (wanted and out.is_terminal):
-        yield None
-        return
-    with out.status("first reconstruction") as status:
+    @cached_property
+    def frame(self) -> Display:
+        """Where to look at it."""
+        return display(self.result.reconstruction, self.file.tracks, y_up=self.y_up)
 
-        def show(row: lm.Row) -> None:
-            rms = float(np.sqrt(row.cost / len(tracks)))
-            status.update(f"evaluation {row.iteration + 1}: RMS {rms:.6f} px")
+    def more(self) -> dict[str, Any]:
+        """Return what the result does not hold."""
+        return {
+            "source": str(self.source),
+            "n_views": self.file.tracks.n_views,
+            "n_points": self.file.tracks.n_points,
+            "view_numbers": self.file.views,
+            "point_numbers": self.file.points,
+            "seconds": self.seconds,
+        }
 
-        yield show
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        document: dict[str, Any] = plain(self.result)
+        document |= document.pop("reconstruction")
+        if self.model is not None:
+            document["colmap_rms_px"] = self.model.rms_px
+        return document | self.more()
 
+    def save(self, path: Path) -> None:
+        """Write the result, with the tracks it belongs to, or a cloud of points and centres."""
+        if path.suffix.lower() == ".npz":
+            save_result(path, self.result, **arrays_of(self.file.tracks), **self.more())
+            return
+        frame = self.frame
+        points = frame.points[frame.shown]
+        counts = [len(points), len(frame.centres)]
+        save_ply(
+            path,
+            np.vstack([points, frame.centres]),
+            np.repeat(np.array([_POINT, _CAMERA], np.uint8), counts, 0),
+            "points blue, cameras orange; a basis to look at, not a calibration",
+        )
 
-def _save(path: Path, result: eg.BundleResult, tracks: eg.Tracks, more: dict[str, Any]) -> None:
-    """Write the result, with the tracks it belongs to, or a cloud of points and centres."""
-    if path.suffix.lower() == ".npz":
-        save_result(path, result, **arrays_of(tracks), **more)
-        return
-    frame = display(result.reconstruction, tracks)
-    points = frame.points[frame.shown]
-    colours = np.repeat(np.array([_POINT, _CAMERA], np.uint8), [len(points), tracks.n_views], 0)
-    save_ply(
-        path,
-        np.vstack([points, frame.centres]),
-        colours,
-        "points blue, cameras orange; a basis to look at, not a calibration",
-    )
+    def draw(self, path: Path) -> None:
+        """Draw a picture, or write a page."""
+        result, tracks = self.result, self.file.tracks
+        title = named(self.source)
+        if path.suffix.lower() == ".html":
+            from epigauge.reports import save_viewer
 
+            numbers = {"view_numbers": self.file.views, "point_numbers": self.file.points}
+            save_viewer(path, result, tracks, title, frame=self.frame, **numbers)
+            return
+        from epigauge.plots import plot_bundle, save_figure
 
-def _draw(path: Path, result: eg.BundleResult, tracks: eg.Tracks, source: Path) -> None:
-    from epigauge.plots import plot_bundle, save_figure
+        save_figure(plot_bundle(result, tracks, title, frame=self.frame), path)
 
-    save_figure(plot_bundle(result, tracks, source.name), path)
+    def save_colmap(self, directory: Path) -> ArgumentError | None:
+        """Write a text model, the views called as in the file of tracks, or return why not."""
+        tracks = self.file.tracks
+        try:
+            self.model = pinhole_model(self.result.reconstruction, tracks, frame=self.frame)
+        except ArgumentError as error:
+            return error
+        names = [f"view{number:04d}" for number in self.file.views.tolist()]
+        save_colmap_model(directory, self.model, tracks, names=names)
+        return None
 
-
-def _report(
-    out: Console, result: eg.BundleResult, tracks: eg.Tracks, source: Path, seconds: float
-) -> None:
-    """Tell people on stderr what came out."""
-    rows = {
-        "tracks": f"{tracks.n_views} views, {tracks.n_points} points, {len(tracks)} observations",
-        "method": result.method,
-        "rms_px": f"{result.rms_px:.6g} per coordinate",
-        "cost": f"{result.cost:.8g} px^2",
-        "evaluations": f"{result.nfev}, with {result.njev} linearisations",
-        "status": escape(result.message),
-        "seconds": f"{seconds:.2f}",
-    }
-    if result.loss_scale_px:
-        rows["loss_scale_px"] = f"{result.loss_scale_px:.4g}"
-    out.print(facts(escape(shown(source)), rows))
-    if not result.success:
-        out.print(f"[bold red]did not converge:[/] {escape(result.message)}")
+    def report(self, out: Console, interrupted: bool) -> None:
+        """Tell people on stderr what came out."""
+        result, tracks = self.result, self.file.tracks
+        rows = {
+            "tracks": f"{tracks.n_views} views, {tracks.n_points} points, "
+            f"{len(tracks)} observations",
+            "method": result.method,
+            "rms_px": f"{result.rms_px:.6g} per coordinate",
+            "cost": f"{result.cost:.8g} px^2",
+            "evaluations": f"{result.nfev}, with {result.njev} linearisations",
+            "status": "interrupted" if interrupted else escape(result.message),
+            "seconds": f"{self.seconds:.2f}",
+        }
+        if result.loss_scale_px:
+            rows["loss_scale_px"] = f"{result.loss_scale_px:.4g}"
+        if self.model is not None:
+            rows["colmap"] = (
+                f"{self.model.rms_px:.6g} px RMS by pinhole cameras, "
+                f"{self.model.projective_rms_px:.6g} px by the projective ones: their skew is "
+                "left out; a start for `colmap bundle_adjuster`, no calibration"
+            )
+        out.print(facts(escape(shown(self.source)), rows))
+        if not (result.success or interrupted):
+            out.print(f"[bold red]did not converge:[/] {escape(result.message)}")

@@ -6,22 +6,33 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 import epigauge as eg
-from epigauge.cli._common import DONE, NOT_CONVERGED, Json, console, shown, write_json
+from epigauge.cli._common import (
+    DONE,
+    INTERRUPTED,
+    NOT_CONVERGED,
+    Json,
+    console,
+    shown,
+    write_json,
+)
+from epigauge.cli._live import watching
 from epigauge.cli.bundle import (
     Backend,
     Clean,
     MaxIter,
     Start,
     TracksFile,
+    check_target,
     first_reconstruction,
+    named,
 )
 from epigauge.io import load_track_file
-from epigauge.io._common import check_suffix
 from epigauge.multi_view.compare import Comparison
 from epigauge.multi_view.strategies import STRATEGIES
 
@@ -44,25 +55,29 @@ def compare(
     """Adjust the same tracks from the same start by several methods.
 
     Exit code 1 if the default method or, without it, none converged.
+
+    Ctrl-C stops after the evaluation being done: what has been measured so far
+    is reported, with exit code 130.
     """
     if plot is not None:
-        check_suffix(plot, ".png", ".svg")
+        check_target(plot, ".png", ".svg")
     out = console()
     file = load_track_file(tracks, clean)
     chosen = methods if methods == "all" else [name.strip() for name in methods.split(",")]
-    with out.status("first reconstruction") as status:
+    with watching(out, len(file.tracks), "first reconstruction", not json) as watch:
         comparison = eg.compare(
             file.tracks,
             chosen,
             first_reconstruction(file, tracks, start, backend),
-            on_method=status.update,
+            on_method=watch.begin,
+            callback=watch,
             max_iter=max_iter,
             backend=backend,
         )
     if plot is not None:
         from epigauge.plots import save_figure
 
-        save_figure(comparison.plot(tracks.name), plot)
+        save_figure(comparison.plot(named(tracks)), plot)
     if json:
         write_json(
             {
@@ -74,7 +89,12 @@ def compare(
     elif markdown:
         typer.echo(comparison.to_markdown(), nl=False)
     else:
-        print_table(out, comparison, f"{shown(tracks)}: {file.tracks}")
+        size = f"{file.tracks.n_views} views, {file.tracks.n_points} points"
+        print_table(out, comparison, f"{shown(tracks)}: {size}")
+    if watch.interrupted:
+        done = f"[bold red]interrupted[/] at {comparison.rows[-1].method}: this is what was done"
+        out.print(done)
+        return INTERRUPTED
     return exit_code(comparison)
 
 
@@ -85,11 +105,13 @@ def print_table(out: Console, comparison: Comparison, title: str) -> None:
         title_justify="left",
         caption=f"start: RMS {comparison.start_rms_px:.4f} px; evals: evaluations of the cost",
         caption_justify="left",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
     )
-    table.add_column("method")
+    table.add_column("method", no_wrap=True)
     for heading in ("evals", "RMS px", "cost px^2", "seconds"):
-        table.add_column(heading, justify="right")
-    table.add_column("end")
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("converged")
     for row in comparison.rows:
         style = "bold" if row.method == "covariant" else None
         table.add_row(
@@ -98,10 +120,13 @@ def print_table(out: Console, comparison: Comparison, title: str) -> None:
             f"{row.rms_px:.6f}",
             f"{row.cost:.8g}",
             f"{row.seconds:.2f}",
-            "converged" if row.success else escape(row.message),
+            "yes" if row.success else "no",
             style=style if row.success else "red",
         )
     out.print(table)
+    for row in comparison.rows:
+        if not row.success:
+            out.print(f"[red]{row.method}:[/] {escape(row.message)}")
 
 
 def exit_code(comparison: Comparison) -> int:

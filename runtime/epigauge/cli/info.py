@@ -12,6 +12,7 @@ from typing import Any
 from rich.markup import escape
 
 import epigauge as eg
+from epigauge import _library
 from epigauge.cli._common import DONE, Json, console, facts, write_json
 
 #: Module and the distributions that may bring it.
@@ -36,6 +37,8 @@ def info(json: Json = False) -> int:
         "cores": os.cpu_count(),
         "backend": eg.backend(),
         "backends": eg.kernels.available(),
+        "c_variant": _library.variant() if eg.kernels.available()["c"] is None else None,
+        "c_variants": list(_library.usable()) if eg.kernels.available()["c"] is None else [],
         "packages": {module: version(module) for module in _PACKAGES},
     }
     if json:
@@ -47,6 +50,9 @@ def info(json: Json = False) -> int:
     for name, reason in known["backends"].items():
         active = ", active" if name == known["backend"] else ""
         rows[f"backend {name}"] = f"available{active}" if reason is None else reason
+    if known["c_variant"] is not None:
+        others = ", ".join(name for name in known["c_variants"] if name != known["c_variant"])
+        rows["c compiled for"] = known["c_variant"] + (f" (also there: {others})" if others else "")
     rows |= {name: version or "not installed" for name, version in known["packages"].items()}
     console().print(facts("", {name: escape(value) for name, value in rows.items()}))
     return DONE

@@ -1,4 +1,4 @@
-"""Point matches and tracks in, results out: CSV, TXT, BAL, NPZ, JSON and PLY.
+"""Point matches and tracks in, results out: CSV, TXT, BAL, NPZ, JSON, PLY, COLMAP.
 
 Files are untrusted. Nothing is unpickled, sizes are checked before anything is allocated, and a
 file that cannot be used is refused with a `FileFormatError` that names the file, the line where
@@ -8,6 +8,7 @@ Files are written under a temporary name and moved into place: a half-written on
 
 from __future__ import annotations
 
+from epigauge.io._colmap_text import save_colmap_model
 from epigauge.io._common import MAX_MATCHES
 from epigauge.io.matches import Matches, load_matches, save_matches
 from epigauge.io.output import plain, save_result, writing
@@ -30,6 +31,7 @@ __all__ = [
     "load_track_file",
     "load_tracks",
     "plain",
+    "save_colmap_model",
     "save_matches",
     "save_ply",
     "save_reconstruction",

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._common import MAX_MATCHES
 from epigauge.io._npz import damage
+from epigauge.io._rotations import quaternion
 from epigauge.io._text import numbers, text_lines
 from epigauge.multi_view.tracks import Reconstruction, Tracks
 
@@ -176,12 +177,7 @@ def _nine_numbers(i: int, P: Array) -> Array:
 
 def _rodrigues(R: Array) -> Array:
     """Return the axis of a rotation times its angle, by its quaternion."""
-    # The largest of the four equations for the quaternion loses no digits.
-    xx, yy, zz = np.diag(R)
-    skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    even = R + R.T - np.trace(R) * np.eye(3)
-    Q = np.block([[np.array([[xx + yy + zz]]), skew[None]], [skew[:, None], even]])
-    w, *axis = np.linalg.eigh(Q)[1][:, 3]
+    w, *axis = quaternion(R)
     sine = float(np.linalg.norm(axis))
     if sine == 0.0:
         return np.zeros(3)

@@ -95,8 +95,12 @@ def load_track_file(
 
     Parameters
     ----------
-    path, clean, views
-        As for `load_tracks`.
+    path : str or path
+        The file, as for `load_tracks`.
+    clean : bool
+        Keep only what the file marks as clean.
+    views : iterable of int, optional
+        Keep only these views.
     with_start : bool
         Read the reconstruction too, where there is one.
 

@@ -59,7 +59,13 @@ class Comparison:
     start_rms_px: float
 
     def to_markdown(self) -> str:
-        """Return a table in Markdown."""
+        """Return a table in Markdown.
+
+        Returns
+        -------
+        str
+            One line a method.
+        """
         head = ("method", "evaluations", "steps", "RMS (px)", "cost (px^2)", "seconds", "end")
         lines = ["| " + " | ".join(head) + " |", "|---|" + "---:|" * 5 + "---|"]
         lines += [
@@ -70,7 +76,18 @@ class Comparison:
         return "\n".join(lines) + "\n"
 
     def plot(self, title: str = "") -> Figure:
-        """Return the picture of `plots.plot_comparison`."""
+        """Draw the lowest cost so far of each method, by evaluations.
+
+        Parameters
+        ----------
+        title : str
+            What to call the tracks.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            That of `plots.plot_comparison`.
+        """
         from epigauge.plots import plot_comparison
 
         return plot_comparison(self, title)
@@ -95,7 +112,8 @@ def compare(
     start : Reconstruction, optional
         Where all begin; by default `initialize(tracks)`.
     on_method : callable, optional
-        Called with the name of each method before it runs.
+        Called with the name of each method before it runs; a true return value leaves out this
+        one and the rest, but never the first.
     **options
         For `bundle_adjust`, the same for all.
 
@@ -116,10 +134,10 @@ def compare(
         as_choice("methods", name, STRATEGIES)
     if start is None:
         start = initialize(tracks, backend=options.get("backend"))
-    rows = []
+    rows: list[ComparedMethod] = []
     for name in names:
-        if on_method is not None:
-            on_method(name)
+        if on_method is not None and on_method(name) and rows:
+            break
         begin = time.perf_counter()
         result = bundle_adjust(tracks, start, method=name, **options)
         seconds = time.perf_counter() - begin

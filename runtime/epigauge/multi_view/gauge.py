@@ -52,18 +52,43 @@ class Transformation:
     point_scales: Array
 
     def apply(self, P: Array, Q: Array) -> tuple[Array, Array]:
-        """Return the moved cameras and points."""
+        """Move cameras and points.
+
+        Parameters
+        ----------
+        P : ndarray, shape (n, 3, 4)
+            Cameras.
+        Q : ndarray, shape (m, 4)
+            Points.
+
+        Returns
+        -------
+        P, Q : ndarray, shape (n, 3, 4), (m, 4)
+            The same geometry.
+        """
         cameras = self.camera_scales[:, None, None] * (P @ self.T)
         return cameras, self.point_scales[:, None] * np.linalg.solve(self.T, Q.T).T
 
     def inverse(self) -> Transformation:
-        """Return the transformation back."""
+        """Return the transformation back.
+
+        Returns
+        -------
+        Transformation
+            What undoes this one.
+        """
         return Transformation(
             np.asarray(np.linalg.inv(self.T)), 1.0 / self.camera_scales, 1.0 / self.point_scales
         )
 
     def blocks(self) -> tuple[Array, Array]:
-        """Return the blocks of T~ (B03 eq. 5), (n, 12, 12) and (m, 4, 4)."""
+        """Return the blocks of T~ on its diagonal (B03 eq. 5).
+
+        Returns
+        -------
+        cameras, points : ndarray, shape (n, 12, 12), (m, 4, 4)
+            They act on vect(P_i) and on Q_j.
+        """
         cameras = self.camera_scales[:, None, None] * np.asarray(np.kron(np.eye(3), self.T.T))
         return cameras, self.point_scales[:, None, None] * np.linalg.inv(self.T)
 
@@ -72,7 +97,20 @@ class Gauge(Protocol):
     """A rule that chooses basis and scales."""
 
     def transformation(self, P: Array, Q: Array) -> Transformation:
-        """Return what moves cameras (n, 3, 4) and points (m, 4) into the gauge."""
+        """Return what moves cameras and points into the gauge.
+
+        Parameters
+        ----------
+        P : ndarray, shape (n, 3, 4)
+            Cameras.
+        Q : ndarray, shape (m, 4)
+            Points.
+
+        Returns
+        -------
+        Transformation
+            For this reconstruction.
+        """
 
 
 def transform(
@@ -247,6 +285,18 @@ class five_points:
 
         The candidates are spread as far as possible in the normalised basis. All that is compared
         are cosines and minors there, so that the choice is the same in every basis.
+
+        Parameters
+        ----------
+        Q : ndarray, shape (m, 4)
+            Points in any basis.
+        candidates : int
+            How many.
+
+        Returns
+        -------
+        list of int
+            Their numbers.
         """
         moved = normalized().transformation(np.zeros((0, 3, 4)), Q).apply(np.zeros((0, 3, 4)), Q)[1]
         # The loneliest point, of the smallest sum of fourth powers of cosines with all others.

@@ -91,7 +91,7 @@ class Tracks:
 
         Parameters
         ----------
-        view, point, xy, weights
+        view, point, xy, weights : array_like
             As for the constructor, with gaps allowed.
 
         Returns
@@ -190,16 +190,35 @@ class Reconstruction:
         object.__setattr__(self, "Q", _homogeneous("Q", self.Q, (4,)))
 
     def project(self, tracks: Tracks) -> Array:
-        """Return the predicted pixels of all observations, shape (N, 2), in the tracks' order.
+        """Return the predicted pixels of all observations.
 
-        Infinite or NaN for points in a camera's focal plane.
+        Parameters
+        ----------
+        tracks : Tracks
+            Which point is seen in which view.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            In the tracks' order; infinite or NaN for points in a camera's focal plane.
         """
         h = np.einsum("nij,nj->ni", self.P[tracks.view], self.Q[tracks.point])
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(h[:, :2] / h[:, 2:])
 
     def rms_px(self, tracks: Tracks) -> float:
-        """Return sqrt(sum of squared residual coordinates / (2 N))."""
+        """Return the root mean square of the residual coordinates.
+
+        Parameters
+        ----------
+        tracks : Tracks
+            Observations.
+
+        Returns
+        -------
+        float
+            sqrt(sum of squared residual coordinates / (2 N)), in pixels.
+        """
         return float(np.sqrt(np.mean((tracks.xy - self.project(tracks)) ** 2)))
 
 

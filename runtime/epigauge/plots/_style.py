@@ -19,13 +19,20 @@ if TYPE_CHECKING:
 GREY, BLUE, RED = "0.45", "#2a6f97", "#c1121f"
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of a size in inches, or say how to get Matplotlib."""
+def need_matplotlib() -> None:
+    """Say how to get Matplotlib where it is not installed."""
     try:
-        from matplotlib.figure import Figure
-        from matplotlib.layout_engine import ConstrainedLayoutEngine
+        import matplotlib.figure  # noqa: F401
     except ImportError:
         raise MissingPackageError("matplotlib", "plot") from None
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of a size in inches, or say how to get Matplotlib."""
+    need_matplotlib()
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
     layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.1, hspace=0.04)
     return Figure(figsize=(width, height), dpi=110, layout=layout)
 
@@ -92,7 +99,7 @@ def draw_history(axes: Axes, history: Sequence[Row]) -> None:
     finish(axes, "Convergence")
 
 
-def finish(axes: Axes, title: str) -> None:
+def finish(axes: Axes, title: str, legend: bool = True) -> None:
     """Give a panel of curves the common look."""
     axes.set_title(title, loc="left", fontsize=11)
     axes.grid(color="0.9", lw=0.7)
@@ -100,4 +107,5 @@ def finish(axes: Axes, title: str) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color("0.6")
     axes.tick_params(labelsize=8, color=GREY)
-    axes.legend(fontsize=9, frameon=False)
+    if legend:
+        axes.legend(fontsize=9, frameon=False)

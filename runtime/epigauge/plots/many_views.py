@@ -1,45 +1,41 @@
-"""Pictures of an adjusted reconstruction and of methods side by side."""
+"""Pictures of an adjusted reconstruction."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.multi_view.adjust import BundleResult
-from epigauge.multi_view.display import Display, display
+from epigauge.multi_view.display import Display, camera_spacing, display, is_sequence
 from epigauge.multi_view.tracks import Tracks
-from epigauge.plots._style import BLUE, GREY, RED, draw_history, finish, heading, new_figure
+from epigauge.plots._style import BLUE, RED, draw_history, finish, heading, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from epigauge.multi_view.compare import Comparison
-
-__all__ = ["plot_bundle", "plot_comparison"]
+__all__ = ["plot_bundle"]
 
 Array = NDArray[np.float64]
 
 _WIDTH = 11.0  # inches
-_CAMERA = "#e07a1f"
-_PYRAMID = (0.1, 0.35)  # height of a camera, in usual distances of a point from the middle
-_COLOURS = (
-    *("#6c757d", "#2a6f97", "#61a5c2", "#2d6a4f", "#74c69d", "#b5838d"),
-    *("#7b2cbf", "#e07a1f", "#a47148", "#212529"),
-)
-_MARKERS = "vs^D<>PXdp"
+_CAMERA = "#c25e00"
+_PYRAMID = (0.1, 0.35)  # length of a camera, in usual distances of a point from the middle
+_STRAY = 0.005  # share of the points that a picture may leave out at either end of an axis
 
 
-def plot_bundle(result: BundleResult, tracks: Tracks, title: str = "") -> Figure:
-    """Show points and cameras from two sides, the residuals, and the convergence.
+def plot_bundle(
+    result: BundleResult, tracks: Tracks, title: str = "", *, frame: Display | None = None
+) -> Figure:
+    """Show points and cameras from three sides, the residuals, and the convergence.
 
     Above the scene in a basis in which it looks plausible (see `display`): that is no calibration,
-    and nothing can be measured in it. Cameras are pyramids, drawn nearer where they
-    are far away; colour is depth.
-    Below the residual coordinates with the Gaussian of deviation 1.48 median |r|, and the cost of
-    each evaluation, less the lowest one.
+    and nothing can be measured in it. Cameras are pyramids, drawn nearer where they are far away;
+    the colour of a point is its distance from the viewer of the first picture.
+    Below the residual coordinates with the Gaussian of deviation 1.48 median(abs(r)), and the cost
+    of each evaluation, less the lowest one.
 
     Parameters
     ----------
@@ -49,6 +45,8 @@ def plot_bundle(result: BundleResult, tracks: Tracks, title: str = "") -> Figure
         Observations.
     title : str
         What to call them.
+    frame : Display, optional
+        Where to show them; by default ``display(result.reconstruction, tracks)``.
 
     Returns
     -------
@@ -61,100 +59,101 @@ def plot_bundle(result: BundleResult, tracks: Tracks, title: str = "") -> Figure
         If Matplotlib is not installed.
     """
     figure = new_figure(_WIDTH, 9.0)
-    shown = display(result.reconstruction, tracks)
+    shown = display(result.reconstruction, tracks) if frame is None else frame
     text = f"{title}: " if title else ""
     text += f"{tracks.n_views} views, {tracks.n_points} points, RMS {result.rms_px:.4g} px"
+    if result.loss_scale_px:
+        text += f" (robust loss of scale {result.loss_scale_px:.2g} px)"
     heading(figure, text, "" if result.success else result.message)
-    grid = figure.add_gridspec(2, 6, height_ratios=(5.2, 3.0))
-    oblique = figure.add_subplot(grid[0, :4])
-    _draw_scene(oblique, shown, _OBLIQUE)
-    oblique.set_title("Points and cameras (to look at; no calibration)", loc="left", fontsize=11)
-    above = figure.add_subplot(grid[0, 4:])
-    _draw_scene(above, shown, _ABOVE)
-    above.set_title("From above", loc="left", fontsize=11)
-    _draw_residuals(figure.add_subplot(grid[1, :3]), result.fun.ravel())
-    draw_history(figure.add_subplot(grid[1, 3:]), result.history)
+    grid = figure.add_gridspec(3, 6, height_ratios=(2.6, 2.6, 2.9))
+    oblique = figure.add_subplot(grid[:2, :4])
+    _draw_scene(oblique, shown, _OBLIQUE, floor=True)
+    if shown.distorted:
+        caption = "Points and cameras (distorted: in no basis do all cameras look usual)"
+    else:
+        caption = "Points and cameras (to look at; no calibration)"
+    oblique.set_title(caption, loc="left", fontsize=11)
+    for row, side, name in ((0, _ABOVE, "From above"), (1, _SIDE, "From the side")):
+        axes = figure.add_subplot(grid[row, 4:])
+        _draw_scene(axes, shown, side)
+        axes.set_title(name, loc="left", fontsize=11)
+    _draw_residuals(figure.add_subplot(grid[2, :3]), result.fun.ravel())
+    draw_history(figure.add_subplot(grid[2, 3:]), result.history)
     return figure
 
 
-def plot_comparison(comparison: Comparison, title: str = "") -> Figure:
-    """Show for each method the lowest cost so far, less the best of all, by evaluations.
+def _draw_scene(axes: Axes, shown: Display, side: Array, floor: bool = False) -> None:
+    """Draw points and cameras as seen from one side, near things over far ones.
 
-    Parameters
-    ----------
-    comparison : Comparison
-        What `compare` returned.
-    title : str
-        What to call the tracks.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        The picture, not yet drawn: see `save_figure`.
-
-    Raises
-    ------
-    MissingPackageError
-        If Matplotlib is not installed.
+    With a floor they are seen in perspective and stand on a grid; else without it, to scale.
     """
-    figure = new_figure(_WIDTH, 6.0)
-    heading(figure, "Convergence of the methods" + (f": {title}" if title else ""))
-    axes = figure.add_subplot()
-    best = min(row.cost for row in comparison.rows)
-    # Below this the costs of two converged runs do not differ by anything but where they stopped.
-    floor = max(best * 1e-9, 1e-300)
-    slowest = max(row.nfev for row in comparison.rows)
-    for k, row in enumerate(comparison.rows):
-        costs = np.array(
-            [np.inf if not r.accepted and i else r.cost for i, r in enumerate(row.history)]
-        )
-        above = np.maximum(np.minimum.accumulate(costs) - best, floor)
-        strong = row.method == "covariant"
-        axes.plot(
-            np.arange(1, len(above) + 1),
-            above,
-            color=RED if strong else _COLOURS[k % len(_COLOURS)],
-            marker="o" if strong else _MARKERS[k % len(_MARKERS)],
-            ms=6 if strong else 4,
-            lw=2.6 if strong else 1.3,
-            markevery=max(1, len(above) // 12),
-            zorder=4 if strong else 3,
-            label=f"{row.method}: {row.nfev}" + ("" if row.success else ", not converged"),
-        )
-    axes.axhline(floor, color=GREY, lw=0.8, ls=":")
-    axes.set(yscale="log", xlabel="evaluations of the cost")
-    axes.set(ylabel="lowest cost so far, above the best (px\N{SUPERSCRIPT TWO})")
-    if slowest > 30:
-        ticks = [tick for tick in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000) if tick <= slowest]
-        axes.set(xscale="log")
-        axes.set_xticks(ticks, list(map(str, ticks)))
-        axes.set_xticks([], minor=True)
-    finish(axes, f"best cost {best:.7g} px\N{SUPERSCRIPT TWO}")
-    axes.legend(
-        title="method: evaluations", loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False
-    )
-    return figure
-
-
-def _draw_scene(axes: Axes, shown: Display, side: Array) -> None:
-    """Draw points and cameras as seen from one side, near things over far ones."""
     points = shown.points[shown.shown]
-    seen = points @ side.T
-    order = np.argsort(-seen[:, 2])
-    x, y, depth = *seen[order, :2].T, points[order, 1]
-    axes.scatter(x, y, c=depth, cmap="viridis", s=_size(len(points)), lw=0.0)
-    axes.plot(*(shown.centres @ side.T)[:, :2].T, color=_CAMERA, lw=0.7, alpha=0.6)
-    steps = np.linalg.norm(np.diff(shown.centres, axis=0), axis=1)
-    height = float(np.clip(np.median(steps), *_PYRAMID))
-    for centre, corners in zip(shown.centres, shown.corners, strict=True):
-        rim = centre + height * corners
-        line = np.stack([rim[0], centre, rim[1], rim[0], rim[3], centre, rim[2], rim[3]])
-        axes.plot(*(line @ side.T)[:, :2].T, color=_CAMERA, lw=0.9)
-        axes.plot(*(rim[1:3] @ side.T)[:, :2].T, color=_CAMERA, lw=0.9)
-    axes.set(xticks=[], yticks=[], facecolor="0.975")
+    rims = _rims(shown)
+    low, high = np.quantile(points, (_STRAY, 1.0 - _STRAY), axis=0) if len(points) else (0.0, 0.0)
+    near = points[((points >= low) & (points <= high)).all(axis=1)]
+    framed = np.vstack([near, shown.centres, rims.reshape(-1, 3)])
+    middle = (framed.min(axis=0) + framed.max(axis=0)) / 2.0
+    reach = float(np.linalg.norm(framed - middle, axis=1).max())
+
+    def seen(X: Array) -> Array:
+        """Return right, up, and away of points."""
+        turned = X @ side.T
+        if not floor:
+            return turned
+        centre = middle @ side.T
+        relative = turned - centre
+        shrink = 2.0 * reach / np.maximum(2.0 * reach + relative[..., 2:], 0.2 * reach)
+        return np.asarray(centre + relative * np.concatenate([shrink, shrink, shrink**0], axis=-1))
+
+    if floor:
+        _draw_floor(axes, framed, seen)
+    order = np.argsort(-(points @ side.T)[:, 2], kind="stable")
+    depth = (points @ _OBLIQUE.T)[order, 2]
+    limits = np.quantile(depth, (0.01, 0.99)) if len(depth) else (0.0, 1.0)
+    x, y = seen(points)[order, :2].T
+    size = _size(len(points)) * (1.0 if floor else 0.5)
+    axes.scatter(x, y, c=depth, cmap="viridis", vmin=limits[0], vmax=limits[1], s=size, lw=0.0)
+    _draw_cameras(axes, seen(shown.centres)[:, :2], seen(rims)[..., :2], is_sequence(shown.centres))
+    # The view is fitted to these, not to stray points.
+    around = seen(framed)[:, :2]
+    axes.dataLim.set_points(np.array([around.min(axis=0), around.max(axis=0)]))
+    axes.set(xticks=[], yticks=[], facecolor="0.985")
     axes.set_aspect("equal", adjustable="datalim")
     for spine in axes.spines.values():
         spine.set_color("0.85")
+
+
+def _rims(shown: Display) -> Array:
+    """Return the corners of the cameras' pyramids, (n, 4, 3)."""
+    length = float(np.clip(camera_spacing(shown.centres), *_PYRAMID))
+    return np.asarray(shown.centres[:, None] + length * shown.corners)
+
+
+def _draw_floor(axes: Axes, framed: Array, seen: Any) -> None:
+    """Draw a grid of unit squares under the scene."""
+    from matplotlib.collections import LineCollection
+
+    (x0, y0, _), (x1, y1, _) = np.floor(framed.min(axis=0)), np.ceil(framed.max(axis=0))
+    z = float(framed[:, 2].min())
+    lines = [[(x, y0, z), (x, y1, z)] for x in np.arange(x0, x1 + 0.5)]
+    lines += [[(x0, y, z), (x1, y, z)] for y in np.arange(y0, y1 + 0.5)]
+    ends = seen(np.array(lines))[..., :2]
+    axes.add_collection(LineCollection(list(ends), colors="0.9", lw=0.8, zorder=0), autolim=False)
+
+
+def _draw_cameras(axes: Axes, centres: Array, rims: Array, joined: bool) -> None:
+    """Draw pyramids over what the cameras see, and the path along them."""
+    from matplotlib.collections import LineCollection, PolyCollection
+
+    if joined:
+        axes.plot(*centres.T, color=_CAMERA, lw=0.8, alpha=0.6)
+    faces = PolyCollection(list(rims), facecolors=_CAMERA, alpha=0.12, lw=0.0, zorder=3)
+    axes.add_collection(faces)
+    apex = centres[:, None, None]
+    edges = np.concatenate([np.broadcast_to(apex, rims[:, :, None].shape), rims[:, :, None]], 2)
+    around = np.stack([rims, np.roll(rims, -1, axis=1)], axis=2)
+    lines = np.concatenate([edges, around], axis=1).reshape(-1, 2, 2)
+    axes.add_collection(LineCollection(list(lines), colors=_CAMERA, lw=0.9, zorder=4))
 
 
 def _turned(azimuth: float, elevation: float) -> Array:
@@ -165,7 +164,7 @@ def _turned(azimuth: float, elevation: float) -> Array:
     return np.stack([right, np.cross(right, away), away])
 
 
-_OBLIQUE, _ABOVE = _turned(-28.0, 24.0), _turned(0.0, 90.0)
+_OBLIQUE, _ABOVE, _SIDE = _turned(-28.0, 24.0), _turned(0.0, 90.0), _turned(-90.0, 0.0)
 
 
 def _size(count: int) -> float:

@@ -77,9 +77,9 @@ class Minimum:
     cost: float
 
 
-def supports(chart: Parameterization) -> bool:
-    """Tell whether the compiled loop knows a parameterisation."""
-    return _parts(chart) is not None
+def supports(criterion: str, chart: Parameterization) -> bool:
+    """Tell whether the compiled loop knows a criterion and a parameterisation."""
+    return criterion in _CRITERIA and _parts(chart) is not None
 
 
 def _parts(chart: Any) -> tuple[int, Array | None, Array | None] | None:
@@ -108,7 +108,7 @@ def minimize(
     Parameters
     ----------
     chart : Parameterization
-        One that `supports` accepts.
+        One that `supports` accepts, with its criterion.
     start : OrthonormalF or BlockF
         Where to begin.
     matches : tuple of ndarray, shape (2, m), (2, m), (m,)
@@ -200,8 +200,15 @@ class PairOptions:
     max_iter: int
 
 
-def pair_options(criterion: str, exact: bool, damping: str, stopping: lm.Stopping) -> PairOptions:
-    """Return the options of the orthonormal representation with the linear loss."""
+def pair_options(
+    criterion: str, exact: bool, damping: str, stopping: lm.Stopping
+) -> PairOptions | None:
+    """Return the options of the orthonormal representation with the linear loss.
+
+    None where the compiled loop does not know the criterion.
+    """
+    if criterion not in _CRITERIA:
+        return None
     structure = _options(criterion, 0, "linear", exact, damping, 0.0, stopping)
     return PairOptions(structure, stopping.max_iter)
 

@@ -251,7 +251,7 @@ def _is_native(
     """Tell whether the compiled loop does the same, sooner."""
     over_F = options.structure == "eliminated" and options.parameterization not in REDUNDANT
     plain = matches.table.name == "c" and matches.covariances is None and callback is None
-    return over_F and plain and native.supports(chart)
+    return over_F and plain and native.supports(options.criterion, chart)
 
 
 def _settled(matches: Matches, F: Array, loss: Loss, outcome: lm.Outcome[Any]) -> int:

@@ -1,0 +1,106 @@
+"""README and documentation: all their code runs, prints what they show, and nothing is missing."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+from pathlib import Path
+
+import documents
+import epigauge as eg
+import pytest
+from _pytest.mark import ParameterSet
+from epigauge.datasets import DatasetError, _store
+from epigauge.errors import MissingPackageError
+
+OPTIONAL = ("cv2", "casadi", "matplotlib", "poselib", "pycolmap", "rich", "sympy", "typer")
+#: Public modules beside the package itself, by the name that users write.
+MODULES = {
+    "epigauge.gauge": eg.gauge,
+    **{
+        f"epigauge.{name}": importlib.import_module(f"epigauge.{name}")
+        for name in (
+            *("casadi", "colmap", "datasets", "errors", "images", "interop", "io", "kernels"),
+            *("plots", "reports"),
+        )
+    },
+}
+#: Of these, python and console are run, and text is compared with what is printed.
+KINDS = {"python", "console", "text", "bibtex", "diff"}
+
+
+def parameters() -> list[ParameterSet]:
+    """Return the pages; all but the README take seconds."""
+    return [
+        pytest.param(
+            page,
+            id=page.relative_to(documents.CHECKOUT).as_posix(),
+            marks=[] if page.name == "README.md" else pytest.mark.slow,
+        )
+        for page in documents.pages()
+    ]
+
+
+@pytest.mark.parametrize("page", parameters())
+def test_code_of_the_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def offline(entry: eg.datasets.Dataset, *_: object) -> Path:
+        raise DatasetError(entry.name, "is not on this machine")
+
+    monkeypatch.setattr(_store, "_download", offline)
+    monkeypatch.setenv("EPIGAUGE_CACHE", str(tmp_path / "cache"))
+    if "EPIGAUGE_DATA" not in os.environ:
+        data = documents.CHECKOUT.parent / "shared" / "data"
+        monkeypatch.setenv("EPIGAUGE_DATA", str(data))
+    folder = tmp_path / "work"
+    folder.mkdir()
+    try:
+        documents.run(page, folder)
+    except (DatasetError, MissingPackageError) as error:
+        pytest.skip(str(error))
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in OPTIONAL:
+            raise
+        pytest.skip(f"needs the package {error.name}")
+    for name in documents.pictures(page):
+        assert (folder / name).is_file(), f"no code of the page makes {name}"
+        assert (documents.PICTURES / name).is_file(), f"python tests/documents.py {page}"
+
+
+@pytest.mark.parametrize(
+    ("shown", "agrees"),
+    [
+        ("rms 0.123 px in 5", True),
+        ("rms 0.12 px ... 5", True),
+        ("rms 0.13 px in 5", True),  # a unit of the last digit shown
+        ("rms ~0.15 px in 5", True),
+        ("rms 0.15 px in 5", False),
+        ("rms 0.123 px in 6", False),
+        ("rms 0.123 mm in 5", False),
+    ],
+)
+def test_shown_output_is_compared(shown: str, agrees: bool) -> None:
+    printed = "rms 0.1234567 px   in 5\n"
+    if agrees:
+        documents.compare(printed, shown, "here")
+    else:
+        with pytest.raises(AssertionError, match="here prints"):
+            documents.compare(printed, shown, "here")
+
+
+@pytest.mark.parametrize("page", documents.pages(), ids=lambda page: page.name)
+def test_every_block_is_of_a_kind_that_is_known(page: Path) -> None:
+    kinds = re.findall(r"^ *```+ *([^`\n]+)$", page.read_text(), re.MULTILINE)
+    assert {kind for kind in kinds if not kind.startswith("{")} <= KINDS
+    assert not re.search(r"^```\{code", page.read_text(), re.MULTILINE)  # it would not be run
+
+
+@pytest.mark.parametrize("name", ["epigauge", *MODULES])
+def test_every_public_name_is_in_the_reference(name: str) -> None:
+    pages = (documents.CHECKOUT / "docs" / "api").glob("*.rst")
+    text = "\n".join(page.read_text() for page in pages)
+    documented = set(re.findall(r"^\.\. (?:auto\w+|py:data):: ([\w.]+)", text, re.MULTILINE))
+    module = MODULES.get(name, eg)
+    # What the package itself offers, too, is documented there.
+    public = {f"epigauge.{n}" if n in eg.__all__ else f"{name}.{n}" for n in module.__all__}
+    assert not public - documented - set(MODULES)
