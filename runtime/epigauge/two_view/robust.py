@@ -41,6 +41,11 @@ _DEVIATIONS = 3.0
 
 _ROUNDS = 20
 
+#: Iterations of the front ends: more where the first find fewer right matches than this. With half
+#: of them right, one sample of seven in 128 is clean.
+_ITERATIONS = (1_000, 10_000)
+_MOST_RIGHT = 0.5
+
 #: Options of `refine_fundamental` with one entry a match.
 _PER_MATCH = {"weights": 1, "covariance1": 3, "covariance2": 3}
 
@@ -203,11 +208,14 @@ def _starts(
     few = consensus.few
     x1, x2 = (np.ascontiguousarray(h[:2, few].T) * _PIXELS for h in (consensus.h1, consensus.h2))
     back = np.diag([_PIXELS, _PIXELS, 1.0])
-    found = []
-    for name, threshold in itertools.product(names, thresholds):
-        F = _FRONT_ENDS[name](x1, x2, threshold * _PIXELS, seed)
-        if F is not None and np.isfinite(F).all() and np.linalg.matrix_rank(F) >= 2:
-            found.append((name, consensus.judge(back @ F @ back, threshold / _DEVIATIONS)))
+    found: list[tuple[str, Agreement]] = []
+    for iterations in _ITERATIONS:
+        for name, threshold in itertools.product(names, thresholds):
+            F = _FRONT_ENDS[name](x1, x2, threshold * _PIXELS, seed, iterations)
+            if F is not None and np.isfinite(F).all() and np.linalg.matrix_rank(F) >= 2:
+                found.append((name, consensus.judge(back @ F @ back, threshold / _DEVIATIONS)))
+        if found and max(found, key=lambda start: start[1].score)[1].share > _MOST_RIGHT:
+            break
     if not found:
         F = back @ fundamental_8point(x1, x2) @ back
         found.append(("8point", consensus.judge(F, max(thresholds) / _DEVIATIONS)))
@@ -224,19 +232,19 @@ def _front_ends(robust: str) -> tuple[str, ...]:
     return installed
 
 
-def _poselib(x1: Array, x2: Array, threshold: float, seed: int) -> Array | None:
+def _poselib(x1: Array, x2: Array, threshold: float, seed: int, iterations: int) -> Array | None:
     poselib = importlib.import_module("poselib")
-    options = {"max_epipolar_error": threshold, "seed": seed, "max_iterations": 10_000}
+    options = {"max_epipolar_error": threshold, "seed": seed, "max_iterations": iterations}
     F, _ = poselib.estimate_fundamental(x1, x2, options, {})
     return np.asarray(F, dtype=np.float64)
 
 
-def _opencv(x1: Array, x2: Array, threshold: float, seed: int) -> Array | None:
+def _opencv(x1: Array, x2: Array, threshold: float, seed: int, iterations: int) -> Array | None:
     cv2 = importlib.import_module("cv2")
     parameters = cv2.UsacParams()
     parameters.threshold = threshold
     parameters.confidence = 0.999
-    parameters.maxIterations = 10_000
+    parameters.maxIterations = iterations
     parameters.randomGeneratorState = seed
     parameters.sampler = cv2.SAMPLING_UNIFORM
     parameters.score = cv2.SCORE_METHOD_MAGSAC
@@ -252,7 +260,7 @@ def _opencv(x1: Array, x2: Array, threshold: float, seed: int) -> Array | None:
 
 _MODULES = {"poselib": "poselib", "opencv": "cv2"}
 _PACKAGES = {"poselib": "poselib", "opencv": "opencv-python-headless"}
-_FRONT_ENDS: dict[str, Callable[[Array, Array, float, int], Array | None]] = {
+_FRONT_ENDS: dict[str, Callable[[Array, Array, float, int, int], Array | None]] = {
     "poselib": _poselib,
     "opencv": _opencv,
 }
