@@ -16,6 +16,7 @@ TESTS = Path(__file__).parent
 DEFAULT = (
     *("generated/test_backends.py", "generated/test_foot_points.py", "generated/test_table.py"),
     *("runtime/test_two_view_native.py", "runtime/test_batch.py", "runtime/test_many_fused.py"),
+    *("generated/test_joint.py", "runtime/test_two_view_fused.py"),
 )
 
 

@@ -122,6 +122,9 @@ class Kernel:
         Arguments in call order.
     stages : tuple of Let or Loop
         What is computed before the outputs, in order.
+    staged : bool
+        Whether C computes stage after stage for a chunk of observations, in loops short enough for
+        the registers, rather than all stages in one loop. A pass of a `Loop` is a stage, too.
     family : str
         Model file the kernel comes from; filled in by the registry.
     """
@@ -131,6 +134,7 @@ class Kernel:
     inputs: tuple[Input, ...]
     outputs: tuple[Output, ...]
     stages: tuple[Let | Loop, ...] = ()
+    staged: bool = False
     family: str = field(default="", compare=False)
 
 

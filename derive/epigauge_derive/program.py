@@ -63,9 +63,14 @@ def compile_kernel(kernel: Kernel) -> Program:
     names = _temporary_names()
     statements: list[Assignments | Repeat] = []
     pending: dict[sp.Symbol, sp.Expr] = {}
+    summed = any(output.summed for output in kernel.outputs)
     for stage in kernel.stages:
         if isinstance(stage, Let):
             pending |= stage.values
+            # Results that are not summed belong to the last stage.
+            if kernel.staged and (summed or stage is not kernel.stages[-1]):
+                statements.append(_straight(pending, [], names)[0])
+                pending = {}
             continue
         block, start = _straight(pending, list(stage.start.values()), names)
         pending = {}
@@ -73,7 +78,8 @@ def compile_kernel(kernel: Kernel) -> Program:
         statements.append(_repeat(stage, start, names))
     flat = [entry for output in kernel.outputs for entry in output.entries]
     block, reduced = _straight(pending, flat, names)
-    statements += [block] if block else []
+    # The results of a staged kernel are a stage of their own, also where it names nothing.
+    statements += [block] if block or kernel.staged else []
     results, position = [], 0
     for output in kernel.outputs:
         results.append(tuple(reduced[position : position + len(output.entries)]))

@@ -50,7 +50,7 @@ EG_EXPORT void eg_squared_distance(
 /* Formula: what an observation adds to its point's normal equations: w J_Q^T J_Q and w Z_Q^T
    Z_Q (upper triangles; Z = d log depth), -w J_Q^T (q - q_hat), and |q - q_hat|^2.
    Inputs:  P (3, 4), Q (4,), q (2,), weight ()
-   Outputs: V (10,), D (10,), g (4,), squared ()
+   Outputs: N (10,), D (10,), g (4,), squared ()
    Operations: 138, temporaries: 29. */
 EG_EXPORT void eg_point_normal(
     ptrdiff_t n,
@@ -58,7 +58,7 @@ EG_EXPORT void eg_point_normal(
     const double *EG_RESTRICT Q,
     const double *EG_RESTRICT q,
     const double *EG_RESTRICT weight_array,
-    double *EG_RESTRICT V,
+    double *EG_RESTRICT N,
     double *EG_RESTRICT D,
     double *EG_RESTRICT g,
     double *EG_RESTRICT squared)
@@ -113,16 +113,16 @@ EG_EXPORT void eg_point_normal(
         const double t20 = P21*t18;
         const double t21 = q0 - u;
         const double t22 = q1 - v;
-        V[i] = t1*t1*weight + t2*t2*weight;
-        V[n + i] = t4*t5 + t6*t7;
-        V[2*n + i] = t10*t7 + t5*t9;
-        V[3*n + i] = t12*t5 + t13*t7;
-        V[4*n + i] = t4*t4*weight + t6*t6*weight;
-        V[5*n + i] = t10*t15 + t14*t9;
-        V[6*n + i] = t12*t14 + t13*t15;
-        V[7*n + i] = t10*t10*weight + t9*t9*weight;
-        V[8*n + i] = t12*t16 + t13*t17;
-        V[9*n + i] = t12*t12*weight + t13*t13*weight;
+        N[i] = t1*t1*weight + t2*t2*weight;
+        N[n + i] = t4*t5 + t6*t7;
+        N[2*n + i] = t10*t7 + t5*t9;
+        N[3*n + i] = t12*t5 + t13*t7;
+        N[4*n + i] = t4*t4*weight + t6*t6*weight;
+        N[5*n + i] = t10*t15 + t14*t9;
+        N[6*n + i] = t12*t14 + t13*t15;
+        N[7*n + i] = t10*t10*weight + t9*t9*weight;
+        N[8*n + i] = t12*t16 + t13*t17;
+        N[9*n + i] = t12*t12*weight + t13*t13*weight;
         D[i] = P20*P20*t18;
         D[n + i] = P21*t19;
         D[2*n + i] = P22*t19;
@@ -198,6 +198,70 @@ EG_EXPORT void eg_camera_normal(
         e[i] = -t2;
         e[n + i] = -t3;
         e[2*n + i] = t2*u + t3*v;
+    }
+}
+
+/* Formula: what a line of sight adds to its point's homogeneous equations: sum of w n n^T
+   over the two unit normals n ~ q_k p3 - p_k (upper triangle).
+   Inputs:  P (3, 4), q (2,), weight ()
+   Outputs: N (10,)
+   Operations: 78, temporaries: 22. */
+EG_EXPORT void eg_sight_normal(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P,
+    const double *EG_RESTRICT q,
+    const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT N)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double P00 = P[i];
+        const double P01 = P[n + i];
+        const double P02 = P[2*n + i];
+        const double P03 = P[3*n + i];
+        const double P10 = P[4*n + i];
+        const double P11 = P[5*n + i];
+        const double P12 = P[6*n + i];
+        const double P13 = P[7*n + i];
+        const double P20 = P[8*n + i];
+        const double P21 = P[9*n + i];
+        const double P22 = P[10*n + i];
+        const double P23 = P[11*n + i];
+        const double q0 = q[i];
+        const double q1 = q[n + i];
+        const double weight = weight_array[i];
+        const double t0 = P20*q0 - P00;
+        const double t1 = t0*t0;
+        const double t9 = P20*q1 - P10;
+        const double t10 = t9*t9;
+        const double t11 = P21*q1 - P11;
+        const double t12 = t11*t11;
+        const double t13 = P22*q1 - P12;
+        const double t14 = t13*t13;
+        const double t15 = P23*q1 - P13;
+        const double t16 = t15*t15;
+        const double t17 = 1.0/(t10 + t12 + t14 + t16);
+        const double t2 = P21*q0 - P01;
+        const double t3 = t2*t2;
+        const double t4 = P22*q0 - P02;
+        const double t5 = t4*t4;
+        const double t6 = P23*q0 - P03;
+        const double t7 = t6*t6;
+        const double t8 = 1.0/(t1 + t3 + t5 + t7);
+        const double t18 = t0*t8;
+        const double t19 = t17*t9;
+        const double t20 = t2*t8;
+        const double t21 = t11*t17;
+        N[i] = weight*(t1*t8 + t10*t17);
+        N[n + i] = weight*(t11*t19 + t18*t2);
+        N[2*n + i] = weight*(t13*t19 + t18*t4);
+        N[3*n + i] = weight*(t15*t19 + t18*t6);
+        N[4*n + i] = weight*(t12*t17 + t3*t8);
+        N[5*n + i] = weight*(t13*t21 + t20*t4);
+        N[6*n + i] = weight*(t15*t21 + t20*t6);
+        N[7*n + i] = weight*(t14*t17 + t5*t8);
+        N[8*n + i] = weight*(t13*t15*t17 + t4*t6*t8);
+        N[9*n + i] = weight*(t16*t17 + t7*t8);
     }
 }
 
@@ -290,42 +354,401 @@ EG_EXPORT void eg_coupling(
     }
 }
 
-/* Formula: upper triangular T with T T^T = V^-1, from the upper triangle of V.
-   Inputs:  V (10,)
+/* Formula: unit eigenvector of N (upper triangle) to its least eigenvalue, by squaring N^-1 8
+   times.
+   Inputs:  N (10,)
+   Outputs: X (4,)
+   Operations: 821, temporaries: 66. */
+EG_EXPORT void eg_least_eigenvector(
+    ptrdiff_t n,
+    const double *EG_RESTRICT N,
+    double *EG_RESTRICT X)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double N0 = N[i];
+        const double N1 = N[n + i];
+        const double N2 = N[2*n + i];
+        const double N3 = N[3*n + i];
+        const double N4 = N[4*n + i];
+        const double N5 = N[5*n + i];
+        const double N6 = N[6*n + i];
+        const double N7 = N[7*n + i];
+        const double N8 = N[8*n + i];
+        const double N9 = N[9*n + i];
+        const double trace = N0 + N4 + N7 + N9;
+        const double t0 = 1.0/trace;
+        const double L00 = sqrt(1e-13 + N0*t0);
+        const double L_inverse00 = 1.0/L00;
+        const double t1 = L_inverse00*t0;
+        const double L10 = N1*t1;
+        const double L11 = sqrt(1e-13 + N4*t0 - L10*L10);
+        const double L_inverse11 = 1.0/L11;
+        const double L_inverse10 = -L10*L_inverse00*L_inverse11;
+        const double L20 = N2*t1;
+        const double L21 = L_inverse11*(N5*t0 - L10*L20);
+        const double L22 = sqrt(1e-13 + N7*t0 - L20*L20 - L21*L21);
+        const double L_inverse22 = 1.0/L22;
+        const double L_inverse20 = -L_inverse22*(L20*L_inverse00 + L21*L_inverse10);
+        const double L30 = N3*t1;
+        const double L31 = L_inverse11*(N6*t0 - L10*L30);
+        const double L32 = L_inverse22*(N8*t0 - L20*L30 - L21*L31);
+        const double L33 = sqrt(1e-13 + N9*t0 - L30*L30 - L31*L31 - L32*L32);
+        const double L_inverse33 = 1.0/L33;
+        const double L_inverse30 = -L_inverse33*(L30*L_inverse00 + L31*L_inverse10 + L32*L_inverse20);
+        const double L_inverse21 = -L21*L_inverse11*L_inverse22;
+        const double L_inverse31 = -L_inverse33*(L31*L_inverse11 + L32*L_inverse21);
+        const double L_inverse32 = -L32*L_inverse22*L_inverse33;
+        double power0 = L_inverse00*L_inverse00 + L_inverse10*L_inverse10 + L_inverse20*L_inverse20 + L_inverse30*L_inverse30;
+        double power1 = L_inverse10*L_inverse11 + L_inverse20*L_inverse21 + L_inverse30*L_inverse31;
+        double power2 = L_inverse20*L_inverse22 + L_inverse30*L_inverse32;
+        double power3 = L_inverse30*L_inverse33;
+        double power4 = L_inverse11*L_inverse11 + L_inverse21*L_inverse21 + L_inverse31*L_inverse31;
+        double power5 = L_inverse21*L_inverse22 + L_inverse31*L_inverse32;
+        double power6 = L_inverse31*L_inverse33;
+        double power7 = L_inverse22*L_inverse22 + L_inverse32*L_inverse32;
+        double power8 = L_inverse32*L_inverse33;
+        double power9 = L_inverse33*L_inverse33;
+        {
+            const double size = power0 + power4 + power7 + power9;
+            const double t2 = 1.0/(size*size);
+            const double t3 = power1*power1*t2;
+            const double t4 = power2*power2*t2;
+            const double t5 = power3*power3*t2;
+            const double t6 = power1*t2;
+            const double t7 = power2*t2;
+            const double t8 = power3*t2;
+            const double t10 = power6*power6*t2;
+            const double t9 = power5*power5*t2;
+            const double t11 = power5*t2;
+            const double t12 = power6*t2;
+            const double t13 = power8*power8*t2;
+            const double t14 = power8*t2;
+            const double t15 = t3 + t4 + t5 + power0*power0*t2;
+            const double t16 = power0*t6 + power4*t6 + power5*t7 + power6*t8;
+            const double t17 = power0*t7 + power5*t6 + power7*t7 + power8*t8;
+            const double t18 = power0*t8 + power6*t6 + power8*t7 + power9*t8;
+            const double t19 = t10 + t3 + t9 + power4*power4*t2;
+            const double t20 = power2*t6 + power4*t11 + power7*t11 + power8*t12;
+            const double t21 = power3*t6 + power4*t12 + power8*t11 + power9*t12;
+            const double t22 = t13 + t4 + t9 + power7*power7*t2;
+            const double t23 = power3*t7 + power6*t11 + power7*t14 + power9*t14;
+            const double t24 = t10 + t13 + t5 + power9*power9*t2;
+            power0 = t15;
+            power1 = t16;
+            power2 = t17;
+            power3 = t18;
+            power4 = t19;
+            power5 = t20;
+            power6 = t21;
+            power7 = t22;
+            power8 = t23;
+            power9 = t24;
+        }
+        {
+            const double size = power0 + power4 + power7 + power9;
+            const double t2 = 1.0/(size*size);
+            const double t3 = power1*power1*t2;
+            const double t4 = power2*power2*t2;
+            const double t5 = power3*power3*t2;
+            const double t6 = power1*t2;
+            const double t7 = power2*t2;
+            const double t8 = power3*t2;
+            const double t10 = power6*power6*t2;
+            const double t9 = power5*power5*t2;
+            const double t11 = power5*t2;
+            const double t12 = power6*t2;
+            const double t13 = power8*power8*t2;
+            const double t14 = power8*t2;
+            const double t15 = t3 + t4 + t5 + power0*power0*t2;
+            const double t16 = power0*t6 + power4*t6 + power5*t7 + power6*t8;
+            const double t17 = power0*t7 + power5*t6 + power7*t7 + power8*t8;
+            const double t18 = power0*t8 + power6*t6 + power8*t7 + power9*t8;
+            const double t19 = t10 + t3 + t9 + power4*power4*t2;
+            const double t20 = power2*t6 + power4*t11 + power7*t11 + power8*t12;
+            const double t21 = power3*t6 + power4*t12 + power8*t11 + power9*t12;
+            const double t22 = t13 + t4 + t9 + power7*power7*t2;
+            const double t23 = power3*t7 + power6*t11 + power7*t14 + power9*t14;
+            const double t24 = t10 + t13 + t5 + power9*power9*t2;
+            power0 = t15;
+            power1 = t16;
+            power2 = t17;
+            power3 = t18;
+            power4 = t19;
+            power5 = t20;
+            power6 = t21;
+            power7 = t22;
+            power8 = t23;
+            power9 = t24;
+        }
+        {
+            const double size = power0 + power4 + power7 + power9;
+            const double t2 = 1.0/(size*size);
+            const double t3 = power1*power1*t2;
+            const double t4 = power2*power2*t2;
+            const double t5 = power3*power3*t2;
+            const double t6 = power1*t2;
+            const double t7 = power2*t2;
+            const double t8 = power3*t2;
+            const double t10 = power6*power6*t2;
+            const double t9 = power5*power5*t2;
+            const double t11 = power5*t2;
+            const double t12 = power6*t2;
+            const double t13 = power8*power8*t2;
+            const double t14 = power8*t2;
+            const double t15 = t3 + t4 + t5 + power0*power0*t2;
+            const double t16 = power0*t6 + power4*t6 + power5*t7 + power6*t8;
+            const double t17 = power0*t7 + power5*t6 + power7*t7 + power8*t8;
+            const double t18 = power0*t8 + power6*t6 + power8*t7 + power9*t8;
+            const double t19 = t10 + t3 + t9 + power4*power4*t2;
+            const double t20 = power2*t6 + power4*t11 + power7*t11 + power8*t12;
+            const double t21 = power3*t6 + power4*t12 + power8*t11 + power9*t12;
+            const double t22 = t13 + t4 + t9 + power7*power7*t2;
+            const double t23 = power3*t7 + power6*t11 + power7*t14 + power9*t14;
+            const double t24 = t10 + t13 + t5 + power9*power9*t2;
+            power0 = t15;
+            power1 = t16;
+            power2 = t17;
+            power3 = t18;
+            power4 = t19;
+            power5 = t20;
+            power6 = t21;
+            power7 = t22;
+            power8 = t23;
+            power9 = t24;
+        }
+        {
+            const double size = power0 + power4 + power7 + power9;
+            const double t2 = 1.0/(size*size);
+            const double t3 = power1*power1*t2;
+            const double t4 = power2*power2*t2;
+            const double t5 = power3*power3*t2;
+            const double t6 = power1*t2;
+            const double t7 = power2*t2;
+            const double t8 = power3*t2;
+            const double t10 = power6*power6*t2;
+            const double t9 = power5*power5*t2;
+            const double t11 = power5*t2;
+            const double t12 = power6*t2;
+            const double t13 = power8*power8*t2;
+            const double t14 = power8*t2;
+            const double t15 = t3 + t4 + t5 + power0*power0*t2;
+            const double t16 = power0*t6 + power4*t6 + power5*t7 + power6*t8;
+            const double t17 = power0*t7 + power5*t6 + power7*t7 + power8*t8;
+            const double t18 = power0*t8 + power6*t6 + power8*t7 + power9*t8;
+            const double t19 = t10 + t3 + t9 + power4*power4*t2;
+            const double t20 = power2*t6 + power4*t11 + power7*t11 + power8*t12;
+            const double t21 = power3*t6 + power4*t12 + power8*t11 + power9*t12;
+            const double t22 = t13 + t4 + t9 + power7*power7*t2;
+            const double t23 = power3*t7 + power6*t11 + power7*t14 + power9*t14;
+            const double t24 = t10 + t13 + t5 + power9*power9*t2;
+            power0 = t15;
+            power1 = t16;
+            power2 = t17;
+            power3 = t18;
+            power4 = t19;
+            power5 = t20;
+            power6 = t21;
+            power7 = t22;
+            power8 = t23;
+            power9 = t24;
+        }
+        {
+            const double size = power0 + power4 + power7 + power9;
+            const double t2 = 1.0/(size*size);
+            const double t3 = power1*power1*t2;
+            const double t4 = power2*power2*t2;
+            const double t5 = power3*power3*t2;
+            const double t6 = power1*t2;
+            const double t7 = power2*t2;
+            const double t8 = power3*t2;
+            const double t10 = power6*power6*t2;
+            const double t9 = power5*power5*t2;
+            const double t11 = power5*t2;
+            const double t12 = power6*t2;
+            const double t13 = power8*power8*t2;
+            const double t14 = power8*t2;
+            const double t15 = t3 + t4 + t5 + power0*power0*t2;
+            const double t16 = power0*t6 + power4*t6 + power5*t7 + power6*t8;
+            const double t17 = power0*t7 + power5*t6 + power7*t7 + power8*t8;
+            const double t18 = power0*t8 + power6*t6 + power8*t7 + power9*t8;
+            const double t19 = t10 + t3 + t9 + power4*power4*t2;
+            const double t20 = power2*t6 + power4*t11 + power7*t11 + power8*t12;
+            const double t21 = power3*t6 + power4*t12 + power8*t11 + power9*t12;
+            const double t22 = t13 + t4 + t9 + power7*power7*t2;
+            const double t23 = power3*t7 + power6*t11 + power7*t14 + power9*t14;
+            const double t24 = t10 + t13 + t5 + power9*power9*t2;
+            power0 = t15;
+            power1 = t16;
+            power2 = t17;
+            power3 = t18;
+            power4 = t19;
+            power5 = t20;
+            power6 = t21;
+            power7 = t22;
+            power8 = t23;
+            power9 = t24;
+        }
+        {
+            const double size = power0 + power4 + power7 + power9;
+            const double t2 = 1.0/(size*size);
+            const double t3 = power1*power1*t2;
+            const double t4 = power2*power2*t2;
+            const double t5 = power3*power3*t2;
+            const double t6 = power1*t2;
+            const double t7 = power2*t2;
+            const double t8 = power3*t2;
+            const double t10 = power6*power6*t2;
+            const double t9 = power5*power5*t2;
+            const double t11 = power5*t2;
+            const double t12 = power6*t2;
+            const double t13 = power8*power8*t2;
+            const double t14 = power8*t2;
+            const double t15 = t3 + t4 + t5 + power0*power0*t2;
+            const double t16 = power0*t6 + power4*t6 + power5*t7 + power6*t8;
+            const double t17 = power0*t7 + power5*t6 + power7*t7 + power8*t8;
+            const double t18 = power0*t8 + power6*t6 + power8*t7 + power9*t8;
+            const double t19 = t10 + t3 + t9 + power4*power4*t2;
+            const double t20 = power2*t6 + power4*t11 + power7*t11 + power8*t12;
+            const double t21 = power3*t6 + power4*t12 + power8*t11 + power9*t12;
+            const double t22 = t13 + t4 + t9 + power7*power7*t2;
+            const double t23 = power3*t7 + power6*t11 + power7*t14 + power9*t14;
+            const double t24 = t10 + t13 + t5 + power9*power9*t2;
+            power0 = t15;
+            power1 = t16;
+            power2 = t17;
+            power3 = t18;
+            power4 = t19;
+            power5 = t20;
+            power6 = t21;
+            power7 = t22;
+            power8 = t23;
+            power9 = t24;
+        }
+        {
+            const double size = power0 + power4 + power7 + power9;
+            const double t2 = 1.0/(size*size);
+            const double t3 = power1*power1*t2;
+            const double t4 = power2*power2*t2;
+            const double t5 = power3*power3*t2;
+            const double t6 = power1*t2;
+            const double t7 = power2*t2;
+            const double t8 = power3*t2;
+            const double t10 = power6*power6*t2;
+            const double t9 = power5*power5*t2;
+            const double t11 = power5*t2;
+            const double t12 = power6*t2;
+            const double t13 = power8*power8*t2;
+            const double t14 = power8*t2;
+            const double t15 = t3 + t4 + t5 + power0*power0*t2;
+            const double t16 = power0*t6 + power4*t6 + power5*t7 + power6*t8;
+            const double t17 = power0*t7 + power5*t6 + power7*t7 + power8*t8;
+            const double t18 = power0*t8 + power6*t6 + power8*t7 + power9*t8;
+            const double t19 = t10 + t3 + t9 + power4*power4*t2;
+            const double t20 = power2*t6 + power4*t11 + power7*t11 + power8*t12;
+            const double t21 = power3*t6 + power4*t12 + power8*t11 + power9*t12;
+            const double t22 = t13 + t4 + t9 + power7*power7*t2;
+            const double t23 = power3*t7 + power6*t11 + power7*t14 + power9*t14;
+            const double t24 = t10 + t13 + t5 + power9*power9*t2;
+            power0 = t15;
+            power1 = t16;
+            power2 = t17;
+            power3 = t18;
+            power4 = t19;
+            power5 = t20;
+            power6 = t21;
+            power7 = t22;
+            power8 = t23;
+            power9 = t24;
+        }
+        {
+            const double size = power0 + power4 + power7 + power9;
+            const double t2 = 1.0/(size*size);
+            const double t3 = power1*power1*t2;
+            const double t4 = power2*power2*t2;
+            const double t5 = power3*power3*t2;
+            const double t6 = power1*t2;
+            const double t7 = power2*t2;
+            const double t8 = power3*t2;
+            const double t10 = power6*power6*t2;
+            const double t9 = power5*power5*t2;
+            const double t11 = power5*t2;
+            const double t12 = power6*t2;
+            const double t13 = power8*power8*t2;
+            const double t14 = power8*t2;
+            const double t15 = t3 + t4 + t5 + power0*power0*t2;
+            const double t16 = power0*t6 + power4*t6 + power5*t7 + power6*t8;
+            const double t17 = power0*t7 + power5*t6 + power7*t7 + power8*t8;
+            const double t18 = power0*t8 + power6*t6 + power8*t7 + power9*t8;
+            const double t19 = t10 + t3 + t9 + power4*power4*t2;
+            const double t20 = power2*t6 + power4*t11 + power7*t11 + power8*t12;
+            const double t21 = power3*t6 + power4*t12 + power8*t11 + power9*t12;
+            const double t22 = t13 + t4 + t9 + power7*power7*t2;
+            const double t23 = power3*t7 + power6*t11 + power7*t14 + power9*t14;
+            const double t24 = t10 + t13 + t5 + power9*power9*t2;
+            power0 = t15;
+            power1 = t16;
+            power2 = t17;
+            power3 = t18;
+            power4 = t19;
+            power5 = t20;
+            power6 = t21;
+            power7 = t22;
+            power8 = t23;
+            power9 = t24;
+        }
+        const double t25 = power4 - power0;
+        const double t26 = (t25 > 0.0 ? power4 : power0);
+        const double t27 = power7 - t26;
+        const double t28 = power9 - (t27 > 0.0 ? power7 : t26);
+        const double x0 = (t28 > 0.0 ? power3 : (t27 > 0.0 ? power2 : (t25 > 0.0 ? power1 : power0)));
+        const double x1 = (t28 > 0.0 ? power6 : (t27 > 0.0 ? power5 : (t25 > 0.0 ? power4 : power1)));
+        const double x2 = (t28 > 0.0 ? power8 : (t27 > 0.0 ? power7 : (t25 > 0.0 ? power5 : power2)));
+        const double x3 = (t28 > 0.0 ? power9 : (t27 > 0.0 ? power8 : (t25 > 0.0 ? power6 : power3)));
+        const double t29 = 1.0/sqrt(x0*x0 + x1*x1 + x2*x2 + x3*x3);
+        X[i] = t29*x0;
+        X[n + i] = t29*x1;
+        X[2*n + i] = t29*x2;
+        X[3*n + i] = t29*x3;
+    }
+}
+
+/* Formula: upper triangular T with T T^T = N^-1, from the upper triangle of N.
+   Inputs:  N (10,)
    Outputs: T (4, 4)
    Operations: 64, temporaries: 20. */
 EG_EXPORT void eg_inverse_root(
     ptrdiff_t n,
-    const double *EG_RESTRICT V,
+    const double *EG_RESTRICT N,
     double *EG_RESTRICT T)
 {
     EG_SIMD
     for (ptrdiff_t i = 0; i < n; ++i) {
-        const double V0 = V[i];
-        const double V1 = V[n + i];
-        const double V2 = V[2*n + i];
-        const double V3 = V[3*n + i];
-        const double V4 = V[4*n + i];
-        const double V5 = V[5*n + i];
-        const double V6 = V[6*n + i];
-        const double V7 = V[7*n + i];
-        const double V8 = V[8*n + i];
-        const double V9 = V[9*n + i];
-        const double L00 = sqrt(V0);
+        const double N0 = N[i];
+        const double N1 = N[n + i];
+        const double N2 = N[2*n + i];
+        const double N3 = N[3*n + i];
+        const double N4 = N[4*n + i];
+        const double N5 = N[5*n + i];
+        const double N6 = N[6*n + i];
+        const double N7 = N[7*n + i];
+        const double N8 = N[8*n + i];
+        const double N9 = N[9*n + i];
+        const double L00 = sqrt(N0);
         const double L_inverse00 = 1.0/L00;
-        const double L10 = L_inverse00*V1;
-        const double L11 = sqrt(V4 - L10*L10);
+        const double L10 = L_inverse00*N1;
+        const double L11 = sqrt(N4 - L10*L10);
         const double L_inverse11 = 1.0/L11;
         const double L_inverse10 = -L10*L_inverse00*L_inverse11;
-        const double L20 = L_inverse00*V2;
-        const double L21 = L_inverse11*(V5 - L10*L20);
-        const double L22 = sqrt(V7 - L20*L20 - L21*L21);
+        const double L20 = L_inverse00*N2;
+        const double L21 = L_inverse11*(N5 - L10*L20);
+        const double L22 = sqrt(N7 - L20*L20 - L21*L21);
         const double L_inverse22 = 1.0/L22;
         const double L_inverse20 = -L_inverse22*(L20*L_inverse00 + L21*L_inverse10);
-        const double L30 = L_inverse00*V3;
-        const double L31 = L_inverse11*(V6 - L10*L30);
-        const double L32 = L_inverse22*(V8 - L20*L30 - L21*L31);
-        const double L33 = sqrt(V9 - L30*L30 - L31*L31 - L32*L32);
+        const double L30 = L_inverse00*N3;
+        const double L31 = L_inverse11*(N6 - L10*L30);
+        const double L32 = L_inverse22*(N8 - L20*L30 - L21*L31);
+        const double L33 = sqrt(N9 - L30*L30 - L31*L31 - L32*L32);
         const double L_inverse33 = 1.0/L33;
         const double L_inverse30 = -L_inverse33*(L30*L_inverse00 + L31*L_inverse10 + L32*L_inverse20);
         const double L_inverse21 = -L21*L_inverse11*L_inverse22;
@@ -350,14 +773,14 @@ EG_EXPORT void eg_inverse_root(
     }
 }
 
-/* Formula: upper triangular T with T T^T = (V + lam W)^-1, found where W = 1; upper
+/* Formula: upper triangular T with T T^T = (N + lam W)^-1, found where W = 1; upper
    triangles.
-   Inputs:  V (10,), W (10,), lam () shared
+   Inputs:  N (10,), W (10,), lam () shared
    Outputs: T (4, 4)
    Operations: 274, temporaries: 66. */
 EG_EXPORT void eg_damped_inverse_root(
     ptrdiff_t n,
-    const double *EG_RESTRICT V,
+    const double *EG_RESTRICT N,
     const double *EG_RESTRICT W,
     const double *EG_RESTRICT lam_array,
     double *EG_RESTRICT T)
@@ -365,16 +788,16 @@ EG_EXPORT void eg_damped_inverse_root(
     const double lam = lam_array[0];
     EG_SIMD
     for (ptrdiff_t i = 0; i < n; ++i) {
-        const double V0 = V[i];
-        const double V1 = V[n + i];
-        const double V2 = V[2*n + i];
-        const double V3 = V[3*n + i];
-        const double V4 = V[4*n + i];
-        const double V5 = V[5*n + i];
-        const double V6 = V[6*n + i];
-        const double V7 = V[7*n + i];
-        const double V8 = V[8*n + i];
-        const double V9 = V[9*n + i];
+        const double N0 = N[i];
+        const double N1 = N[n + i];
+        const double N2 = N[2*n + i];
+        const double N3 = N[3*n + i];
+        const double N4 = N[4*n + i];
+        const double N5 = N[5*n + i];
+        const double N6 = N[6*n + i];
+        const double N7 = N[7*n + i];
+        const double N8 = N[8*n + i];
+        const double N9 = N[9*n + i];
         const double W0 = W[i];
         const double W1 = W[n + i];
         const double W2 = W[2*n + i];
@@ -387,21 +810,21 @@ EG_EXPORT void eg_damped_inverse_root(
         const double W9 = W[9*n + i];
         const double L00 = sqrt(W0);
         const double L_inverse00 = 1.0/L00;
-        const double N00 = L_inverse00*L_inverse00*V0;
-        const double M00 = sqrt(N00 + lam);
+        const double white00 = L_inverse00*L_inverse00*N0;
+        const double M00 = sqrt(lam + white00);
         const double M_inverse00 = 1.0/M00;
         const double L10 = L_inverse00*W1;
         const double L11 = sqrt(W4 - L10*L10);
         const double L_inverse11 = 1.0/L11;
         const double L_inverse10 = -L10*L_inverse00*L_inverse11;
-        const double t0 = L_inverse10*V0;
-        const double t1 = L_inverse11*V1;
-        const double N01 = L_inverse00*t0 + L_inverse00*t1;
-        const double M10 = M_inverse00*N01;
-        const double t10 = L_inverse10*V1 + L_inverse11*V4;
+        const double t0 = L_inverse10*N0;
+        const double t1 = L_inverse11*N1;
+        const double white01 = L_inverse00*t0 + L_inverse00*t1;
+        const double M10 = M_inverse00*white01;
+        const double t10 = L_inverse10*N1 + L_inverse11*N4;
         const double t9 = t0 + t1;
-        const double N11 = L_inverse10*t9 + L_inverse11*t10;
-        const double M11 = sqrt(N11 + lam - M10*M10);
+        const double white11 = L_inverse10*t9 + L_inverse11*t10;
+        const double M11 = sqrt(lam + white11 - M10*M10);
         const double M_inverse11 = 1.0/M11;
         const double M_inverse10 = -M10*M_inverse00*M_inverse11;
         const double L20 = L_inverse00*W2;
@@ -409,21 +832,21 @@ EG_EXPORT void eg_damped_inverse_root(
         const double L22 = sqrt(W7 - L20*L20 - L21*L21);
         const double L_inverse22 = 1.0/L22;
         const double L_inverse20 = -L_inverse22*(L20*L_inverse00 + L21*L_inverse10);
-        const double t2 = L_inverse20*V0;
+        const double t2 = L_inverse20*N0;
         const double L_inverse21 = -L21*L_inverse11*L_inverse22;
-        const double t3 = L_inverse21*V1;
-        const double t4 = L_inverse22*V2;
-        const double N02 = L_inverse00*t2 + L_inverse00*t3 + L_inverse00*t4;
-        const double M20 = M_inverse00*N02;
-        const double t11 = L_inverse10*V2 + L_inverse11*V5;
-        const double N12 = L_inverse20*t9 + L_inverse21*t10 + L_inverse22*t11;
-        const double M21 = M_inverse11*(N12 - M10*M20);
-        const double t12 = t2 + t3 + t4;
-        const double t13 = L_inverse20*V1 + L_inverse21*V4 + L_inverse22*V5;
-        const double t14 = L_inverse20*V2 + L_inverse21*V5 + L_inverse22*V7;
-        const double N22 = L_inverse20*t12 + L_inverse21*t13 + L_inverse22*t14;
+        const double t3 = L_inverse21*N1;
+        const double t4 = L_inverse22*N2;
+        const double white02 = L_inverse00*t2 + L_inverse00*t3 + L_inverse00*t4;
+        const double M20 = M_inverse00*white02;
+        const double t11 = L_inverse10*N2 + L_inverse11*N5;
+        const double white12 = L_inverse20*t9 + L_inverse21*t10 + L_inverse22*t11;
+        const double M21 = M_inverse11*(white12 - M10*M20);
         const double t15 = -lam;
-        const double M22 = sqrt(N22 - M20*M20 - M21*M21 - t15);
+        const double t12 = t2 + t3 + t4;
+        const double t13 = L_inverse20*N1 + L_inverse21*N4 + L_inverse22*N5;
+        const double t14 = L_inverse20*N2 + L_inverse21*N5 + L_inverse22*N7;
+        const double white22 = L_inverse20*t12 + L_inverse21*t13 + L_inverse22*t14;
+        const double M22 = sqrt(white22 - M20*M20 - M21*M21 - t15);
         const double M_inverse22 = 1.0/M22;
         const double M_inverse20 = -M_inverse22*(M20*M_inverse00 + M21*M_inverse10);
         const double M_inverse21 = -M21*M_inverse11*M_inverse22;
@@ -433,20 +856,20 @@ EG_EXPORT void eg_damped_inverse_root(
         const double L33 = sqrt(W9 - L30*L30 - L31*L31 - L32*L32);
         const double L_inverse33 = 1.0/L33;
         const double L_inverse30 = -L_inverse33*(L30*L_inverse00 + L31*L_inverse10 + L32*L_inverse20);
-        const double t5 = L_inverse30*V0;
+        const double t5 = L_inverse30*N0;
         const double L_inverse31 = -L_inverse33*(L31*L_inverse11 + L32*L_inverse21);
-        const double t6 = L_inverse31*V1;
+        const double t6 = L_inverse31*N1;
         const double L_inverse32 = -L32*L_inverse22*L_inverse33;
-        const double t7 = L_inverse32*V2;
-        const double t8 = L_inverse33*V3;
-        const double N03 = L_inverse00*t5 + L_inverse00*t6 + L_inverse00*t7 + L_inverse00*t8;
-        const double M30 = M_inverse00*N03;
-        const double N13 = L_inverse30*t9 + L_inverse31*t10 + L_inverse32*t11 + L_inverse33*(L_inverse10*V3 + L_inverse11*V6);
-        const double M31 = M_inverse11*(N13 - M10*M30);
-        const double N23 = L_inverse30*t12 + L_inverse31*t13 + L_inverse32*t14 + L_inverse33*(L_inverse20*V3 + L_inverse21*V6 + L_inverse22*V8);
-        const double M32 = M_inverse22*(N23 - M20*M30 - M21*M31);
-        const double N33 = L_inverse30*(t5 + t6 + t7 + t8) + L_inverse31*(L_inverse30*V1 + L_inverse31*V4 + L_inverse32*V5 + L_inverse33*V6) + L_inverse32*(L_inverse30*V2 + L_inverse31*V5 + L_inverse32*V7 + L_inverse33*V8) + L_inverse33*(L_inverse30*V3 + L_inverse31*V6 + L_inverse32*V8 + L_inverse33*V9);
-        const double M33 = sqrt(N33 - M30*M30 - M31*M31 - M32*M32 - t15);
+        const double t7 = L_inverse32*N2;
+        const double t8 = L_inverse33*N3;
+        const double white03 = L_inverse00*t5 + L_inverse00*t6 + L_inverse00*t7 + L_inverse00*t8;
+        const double M30 = M_inverse00*white03;
+        const double white13 = L_inverse30*t9 + L_inverse31*t10 + L_inverse32*t11 + L_inverse33*(L_inverse10*N3 + L_inverse11*N6);
+        const double M31 = M_inverse11*(white13 - M10*M30);
+        const double white23 = L_inverse30*t12 + L_inverse31*t13 + L_inverse32*t14 + L_inverse33*(L_inverse20*N3 + L_inverse21*N6 + L_inverse22*N8);
+        const double M32 = M_inverse22*(white23 - M20*M30 - M21*M31);
+        const double white33 = L_inverse30*(t5 + t6 + t7 + t8) + L_inverse31*(L_inverse30*N1 + L_inverse31*N4 + L_inverse32*N5 + L_inverse33*N6) + L_inverse32*(L_inverse30*N2 + L_inverse31*N5 + L_inverse32*N7 + L_inverse33*N8) + L_inverse33*(L_inverse30*N3 + L_inverse31*N6 + L_inverse32*N8 + L_inverse33*N9);
+        const double M33 = sqrt(white33 - M30*M30 - M31*M31 - M32*M32 - t15);
         const double M_inverse33 = 1.0/M33;
         const double M_inverse30 = -M_inverse33*(M30*M_inverse00 + M31*M_inverse10 + M32*M_inverse20);
         const double M_inverse31 = -M_inverse33*(M31*M_inverse11 + M32*M_inverse21);
@@ -470,14 +893,14 @@ EG_EXPORT void eg_damped_inverse_root(
     }
 }
 
-/* Formula: a point's own damped step -(V + lam (V + W))^-1 g and the decrease of the cost
-   that it promises at most, g^T (V + lam (V + W))^-1 g; upper triangles.
-   Inputs:  V (10,), W (10,), g (4,), lam ()
+/* Formula: a point's own damped step -(N + lam (N + W))^-1 g and the decrease of the cost
+   that it promises at most, g^T (N + lam (N + W))^-1 g; upper triangles.
+   Inputs:  N (10,), W (10,), g (4,), lam ()
    Outputs: step (4,), promised ()
    Operations: 137, temporaries: 24. */
 EG_EXPORT void eg_point_step(
     ptrdiff_t n,
-    const double *EG_RESTRICT V,
+    const double *EG_RESTRICT N,
     const double *EG_RESTRICT W,
     const double *EG_RESTRICT g,
     const double *EG_RESTRICT lam_array,
@@ -486,16 +909,16 @@ EG_EXPORT void eg_point_step(
 {
     EG_SIMD
     for (ptrdiff_t i = 0; i < n; ++i) {
-        const double V0 = V[i];
-        const double V1 = V[n + i];
-        const double V2 = V[2*n + i];
-        const double V3 = V[3*n + i];
-        const double V4 = V[4*n + i];
-        const double V5 = V[5*n + i];
-        const double V6 = V[6*n + i];
-        const double V7 = V[7*n + i];
-        const double V8 = V[8*n + i];
-        const double V9 = V[9*n + i];
+        const double N0 = N[i];
+        const double N1 = N[n + i];
+        const double N2 = N[2*n + i];
+        const double N3 = N[3*n + i];
+        const double N4 = N[4*n + i];
+        const double N5 = N[5*n + i];
+        const double N6 = N[6*n + i];
+        const double N7 = N[7*n + i];
+        const double N8 = N[8*n + i];
+        const double N9 = N[9*n + i];
         const double W0 = W[i];
         const double W1 = W[n + i];
         const double W2 = W[2*n + i];
@@ -511,21 +934,21 @@ EG_EXPORT void eg_point_step(
         const double g2 = g[2*n + i];
         const double g3 = g[3*n + i];
         const double lam = lam_array[i];
-        const double L00 = sqrt(V0 + lam*(V0 + W0));
+        const double L00 = sqrt(N0 + lam*(N0 + W0));
         const double L_inverse00 = 1.0/L00;
-        const double L10 = L_inverse00*(V1 + lam*(V1 + W1));
-        const double L11 = sqrt(V4 + lam*(V4 + W4) - L10*L10);
+        const double L10 = L_inverse00*(N1 + lam*(N1 + W1));
+        const double L11 = sqrt(N4 + lam*(N4 + W4) - L10*L10);
         const double L_inverse11 = 1.0/L11;
         const double L_inverse10 = -L10*L_inverse00*L_inverse11;
-        const double L20 = L_inverse00*(V2 + lam*(V2 + W2));
-        const double L21 = L_inverse11*(V5 + lam*(V5 + W5) - L10*L20);
-        const double L22 = sqrt(V7 + lam*(V7 + W7) - L20*L20 - L21*L21);
+        const double L20 = L_inverse00*(N2 + lam*(N2 + W2));
+        const double L21 = L_inverse11*(N5 + lam*(N5 + W5) - L10*L20);
+        const double L22 = sqrt(N7 + lam*(N7 + W7) - L20*L20 - L21*L21);
         const double L_inverse22 = 1.0/L22;
         const double L_inverse20 = -L_inverse22*(L20*L_inverse00 + L21*L_inverse10);
-        const double L30 = L_inverse00*(V3 + lam*(V3 + W3));
-        const double L31 = L_inverse11*(V6 + lam*(V6 + W6) - L10*L30);
-        const double L32 = L_inverse22*(V8 + lam*(V8 + W8) - L20*L30 - L21*L31);
-        const double L33 = sqrt(V9 + lam*(V9 + W9) - L30*L30 - L31*L31 - L32*L32);
+        const double L30 = L_inverse00*(N3 + lam*(N3 + W3));
+        const double L31 = L_inverse11*(N6 + lam*(N6 + W6) - L10*L30);
+        const double L32 = L_inverse22*(N8 + lam*(N8 + W8) - L20*L30 - L21*L31);
+        const double L33 = sqrt(N9 + lam*(N9 + W9) - L30*L30 - L31*L31 - L32*L32);
         const double L_inverse33 = 1.0/L33;
         const double L_inverse30 = -L_inverse33*(L30*L_inverse00 + L31*L_inverse10 + L32*L_inverse20);
         const double y0 = L_inverse00*g0;

@@ -63,7 +63,7 @@ EG_EXPORT void eg_point_normal(
     const double *EG_RESTRICT Q,
     const double *EG_RESTRICT q,
     const double *EG_RESTRICT weight_array,
-    double *EG_RESTRICT V,
+    double *EG_RESTRICT N,
     double *EG_RESTRICT D,
     double *EG_RESTRICT g,
     double *EG_RESTRICT squared);
@@ -78,6 +78,13 @@ EG_EXPORT void eg_camera_normal(
     double *EG_RESTRICT depth,
     double *EG_RESTRICT e);
 
+EG_EXPORT void eg_sight_normal(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P,
+    const double *EG_RESTRICT q,
+    const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT N);
+
 EG_EXPORT void eg_coupling(
     ptrdiff_t n,
     const double *EG_RESTRICT P,
@@ -86,21 +93,26 @@ EG_EXPORT void eg_coupling(
     const double *EG_RESTRICT T,
     double *EG_RESTRICT Y);
 
+EG_EXPORT void eg_least_eigenvector(
+    ptrdiff_t n,
+    const double *EG_RESTRICT N,
+    double *EG_RESTRICT X);
+
 EG_EXPORT void eg_inverse_root(
     ptrdiff_t n,
-    const double *EG_RESTRICT V,
+    const double *EG_RESTRICT N,
     double *EG_RESTRICT T);
 
 EG_EXPORT void eg_damped_inverse_root(
     ptrdiff_t n,
-    const double *EG_RESTRICT V,
+    const double *EG_RESTRICT N,
     const double *EG_RESTRICT W,
     const double *EG_RESTRICT lam_array,
     double *EG_RESTRICT T);
 
 EG_EXPORT void eg_point_step(
     ptrdiff_t n,
-    const double *EG_RESTRICT V,
+    const double *EG_RESTRICT N,
     const double *EG_RESTRICT W,
     const double *EG_RESTRICT g,
     const double *EG_RESTRICT lam_array,
@@ -215,6 +227,122 @@ EG_EXPORT void eg_error_series(
     ptrdiff_t n,
     const double *EG_RESTRICT K,
     double *EG_RESTRICT e);
+
+EG_EXPORT void eg_canonic_squared(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P2,
+    const double *EG_RESTRICT S,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT squared);
+
+EG_EXPORT void eg_canonic_normal(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P2,
+    const double *EG_RESTRICT S,
+    const double *EG_RESTRICT q,
+    const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT gradient,
+    double *EG_RESTRICT diagonal,
+    double *EG_RESTRICT left,
+    double *EG_RESTRICT right);
+
+EG_EXPORT void eg_canonic_reduced(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P2,
+    const double *EG_RESTRICT S,
+    const double *EG_RESTRICT q,
+    const double *EG_RESTRICT weight_array,
+    const double *EG_RESTRICT damping,
+    double *EG_RESTRICT left,
+    double *EG_RESTRICT right);
+
+EG_EXPORT void eg_canonic_step(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P2,
+    const double *EG_RESTRICT S,
+    const double *EG_RESTRICT q,
+    const double *EG_RESTRICT weight_array,
+    const double *EG_RESTRICT damping,
+    const double *EG_RESTRICT move,
+    double *EG_RESTRICT step);
+
+EG_EXPORT void eg_canonic_change(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P2,
+    const double *EG_RESTRICT S,
+    const double *EG_RESTRICT weight_array,
+    const double *EG_RESTRICT move,
+    const double *EG_RESTRICT step,
+    double *EG_RESTRICT squared_change);
+
+EG_EXPORT void eg_free_squared(
+    ptrdiff_t n,
+    const double *EG_RESTRICT cameras,
+    const double *EG_RESTRICT Q,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT squared);
+
+EG_EXPORT void eg_free_normal(
+    ptrdiff_t n,
+    const double *EG_RESTRICT cameras,
+    const double *EG_RESTRICT Q,
+    const double *EG_RESTRICT q,
+    const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT gradient,
+    double *EG_RESTRICT diagonal,
+    double *EG_RESTRICT left,
+    double *EG_RESTRICT right);
+
+EG_EXPORT void eg_free_reduced(
+    ptrdiff_t n,
+    const double *EG_RESTRICT cameras,
+    const double *EG_RESTRICT Q,
+    const double *EG_RESTRICT q,
+    const double *EG_RESTRICT weight_array,
+    const double *EG_RESTRICT damping,
+    double *EG_RESTRICT left,
+    double *EG_RESTRICT right);
+
+EG_EXPORT void eg_free_step(
+    ptrdiff_t n,
+    const double *EG_RESTRICT cameras,
+    const double *EG_RESTRICT Q,
+    const double *EG_RESTRICT q,
+    const double *EG_RESTRICT weight_array,
+    const double *EG_RESTRICT damping,
+    const double *EG_RESTRICT move,
+    double *EG_RESTRICT step);
+
+EG_EXPORT void eg_free_change(
+    ptrdiff_t n,
+    const double *EG_RESTRICT cameras,
+    const double *EG_RESTRICT Q,
+    const double *EG_RESTRICT weight_array,
+    const double *EG_RESTRICT move,
+    const double *EG_RESTRICT step,
+    double *EG_RESTRICT squared_change);
+
+EG_EXPORT void eg_normalized_reduced(
+    ptrdiff_t n,
+    const double *EG_RESTRICT cameras,
+    const double *EG_RESTRICT Q,
+    const double *EG_RESTRICT q,
+    const double *EG_RESTRICT weight_array,
+    const double *EG_RESTRICT damping,
+    double *EG_RESTRICT left,
+    double *EG_RESTRICT right);
+
+EG_EXPORT void eg_factor_products(
+    ptrdiff_t n,
+    const double *EG_RESTRICT factor_array,
+    const double *EG_RESTRICT right,
+    double *EG_RESTRICT sums);
+
+EG_EXPORT void eg_factor_points(
+    ptrdiff_t n,
+    const double *EG_RESTRICT factor_array,
+    const double *EG_RESTRICT right,
+    double *EG_RESTRICT sums);
 
 EG_EXPORT void eg_loss_huber(
     ptrdiff_t n,

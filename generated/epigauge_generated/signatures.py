@@ -19,7 +19,7 @@ class Signature(NamedTuple):
     formula: str
 
 
-C_DIGEST = "7cc3a5d097e3ac27"
+C_DIGEST = "90f3a45cca83da62"
 
 SIGNATURES = {
     "block_derivatives": Signature(
@@ -49,7 +49,7 @@ SIGNATURES = {
     "point_normal": Signature(
         "bundle",
         (Argument("P", (3, 4), True), Argument("Q", (4,), True), Argument("q", (2,), True), Argument("weight", (), True), ),
-        (Argument("V", (10,), True), Argument("D", (10,), True), Argument("g", (4,), True), Argument("squared", (), True), ),
+        (Argument("N", (10,), True), Argument("D", (10,), True), Argument("g", (4,), True), Argument("squared", (), True), ),
         "what an observation adds to its point's normal equations: w J_Q^T J_Q and w Z_Q^T Z_Q (upper triangles; Z = d log depth), -w J_Q^T (q - q_hat), and |q - q_hat|^2.",
     ),
     "camera_normal": Signature(
@@ -58,29 +58,41 @@ SIGNATURES = {
         (Argument("A", (6,), True), Argument("depth", (), True), Argument("e", (3,), True), ),
         "the factors of what an observation adds to its camera's normal equations: J_P^T J_P = A x Q Q^T (A: upper triangle of 3x3, with weight), Z_P^T Z_P = depth Q Q^T for the last row of P and zero for the others, -w J_P^T (q - q_hat) = e x Q.",
     ),
+    "sight_normal": Signature(
+        "bundle",
+        (Argument("P", (3, 4), True), Argument("q", (2,), True), Argument("weight", (), True), ),
+        (Argument("N", (10,), True), ),
+        "what a line of sight adds to its point's homogeneous equations: sum of w n n^T over the two unit normals n ~ q_k p3 - p_k (upper triangle).",
+    ),
     "coupling": Signature(
         "bundle",
         (Argument("P", (3, 4), True), Argument("Q", (4,), True), Argument("weight", (), True), Argument("T", (4, 4), True), ),
         (Argument("Y", (3, 4), True), ),
         "the factor of camera and point coupled by an observation, w J_P^T J_Q T = Y x Q with Y = w a^T a P T, T a change of the point's parameters.",
     ),
+    "least_eigenvector": Signature(
+        "bundle",
+        (Argument("N", (10,), True), ),
+        (Argument("X", (4,), True), ),
+        "unit eigenvector of N (upper triangle) to its least eigenvalue, by squaring N^-1 8 times.",
+    ),
     "inverse_root": Signature(
         "bundle",
-        (Argument("V", (10,), True), ),
+        (Argument("N", (10,), True), ),
         (Argument("T", (4, 4), True), ),
-        "upper triangular T with T T^T = V^-1, from the upper triangle of V.",
+        "upper triangular T with T T^T = N^-1, from the upper triangle of N.",
     ),
     "damped_inverse_root": Signature(
         "bundle",
-        (Argument("V", (10,), True), Argument("W", (10,), True), Argument("lam", (), False), ),
+        (Argument("N", (10,), True), Argument("W", (10,), True), Argument("lam", (), False), ),
         (Argument("T", (4, 4), True), ),
-        "upper triangular T with T T^T = (V + lam W)^-1, found where W = 1; upper triangles.",
+        "upper triangular T with T T^T = (N + lam W)^-1, found where W = 1; upper triangles.",
     ),
     "point_step": Signature(
         "bundle",
-        (Argument("V", (10,), True), Argument("W", (10,), True), Argument("g", (4,), True), Argument("lam", (), True), ),
+        (Argument("N", (10,), True), Argument("W", (10,), True), Argument("g", (4,), True), Argument("lam", (), True), ),
         (Argument("step", (4,), True), Argument("promised", (), True), ),
-        "a point's own damped step -(V + lam (V + W))^-1 g and the decrease of the cost that it promises at most, g^T (V + lam (V + W))^-1 g; upper triangles.",
+        "a point's own damped step -(N + lam (N + W))^-1 g and the decrease of the cost that it promises at most, g^T (N + lam (N + W))^-1 g; upper triangles.",
     ),
     "project": Signature(
         "camera",
@@ -159,6 +171,84 @@ SIGNATURES = {
         (Argument("K", (9,), True), ),
         (Argument("e", (9,), True), ),
         "e truncated at order n = 0..8, e = sum (-1)^(n+1) (1 + n/2) K(n) with K(n) = g^T (W^-1 N)^n W^-1 g (B03 eq. 10).",
+    ),
+    "canonic_squared": Signature(
+        "joint",
+        (Argument("P2", (3, 4), False), Argument("S", (3,), True), Argument("q", (4,), True), ),
+        (Argument("squared", (), True), ),
+        "squared distance of both images of a point to their measurements.",
+    ),
+    "canonic_normal": Signature(
+        "joint",
+        (Argument("P2", (3, 4), False), Argument("S", (3,), True), Argument("q", (4,), True), Argument("weight", (), True), ),
+        (Argument("gradient", (3,), True), Argument("diagonal", (3,), True), Argument("left", (9,), True), Argument("right", (14,), True), ),
+        "gradient and diagonal of V, by the point, and the factors of U = L x Q Q^T (upper triangle of L for each moving camera) and of its gradient e x Q: left = (L, e), right = (upper triangle of Q Q^T, Q).",
+    ),
+    "canonic_reduced": Signature(
+        "joint",
+        (Argument("P2", (3, 4), False), Argument("S", (3,), True), Argument("q", (4,), True), Argument("weight", (), True), Argument("damping", (4,), False), ),
+        (Argument("left", (9,), True), Argument("right", (14,), True), ),
+        "factors of the Schur complement U - W V^-1 W^T = L x Q Q^T and of the gradient g - W V^-1 g_point = e x Q: left = (upper triangle of L, e), right = (upper triangle of Q Q^T, Q); damping = (plain, relative, floor, bind): V has bind Q Q^T added, then plain + relative max(V_ii, floor) on its diagonal.",
+    ),
+    "canonic_step": Signature(
+        "joint",
+        (Argument("P2", (3, 4), False), Argument("S", (3,), True), Argument("q", (4,), True), Argument("weight", (), True), Argument("damping", (4,), False), Argument("move", (3, 4), False), ),
+        (Argument("step", (3,), True), ),
+        "step -V^-1 (g_point + W^T move) of a point for a step of the cameras, and Z Q beside W^T move for the last four rows where there are ten; damping = (plain, relative, floor, bind): V has bind Q Q^T added, then plain + relative max(V_ii, floor) on its diagonal.",
+    ),
+    "canonic_change": Signature(
+        "joint",
+        (Argument("P2", (3, 4), False), Argument("S", (3,), True), Argument("weight", (), True), Argument("move", (3, 4), False), Argument("step", (3,), True), ),
+        (Argument("squared_change", (), False), ),
+        "w |J step|^2 for a step of the cameras (move) and of the point.",
+    ),
+    "free_squared": Signature(
+        "joint",
+        (Argument("cameras", (6, 4), False), Argument("Q", (4,), True), Argument("q", (4,), True), ),
+        (Argument("squared", (), True), ),
+        "squared distance of both images of a point to their measurements.",
+    ),
+    "free_normal": Signature(
+        "joint",
+        (Argument("cameras", (6, 4), False), Argument("Q", (4,), True), Argument("q", (4,), True), Argument("weight", (), True), ),
+        (Argument("gradient", (4,), True), Argument("diagonal", (4,), True), Argument("left", (18,), True), Argument("right", (14,), True), ),
+        "gradient and diagonal of V, by the point, and the factors of U = L x Q Q^T (upper triangle of L for each moving camera) and of its gradient e x Q: left = (L, e), right = (upper triangle of Q Q^T, Q).",
+    ),
+    "free_reduced": Signature(
+        "joint",
+        (Argument("cameras", (6, 4), False), Argument("Q", (4,), True), Argument("q", (4,), True), Argument("weight", (), True), Argument("damping", (4,), False), ),
+        (Argument("left", (27,), True), Argument("right", (14,), True), ),
+        "factors of the Schur complement U - W V^-1 W^T = L x Q Q^T and of the gradient g - W V^-1 g_point = e x Q: left = (upper triangle of L, e), right = (upper triangle of Q Q^T, Q); damping = (plain, relative, floor, bind): V has bind Q Q^T added, then plain + relative max(V_ii, floor) on its diagonal.",
+    ),
+    "free_step": Signature(
+        "joint",
+        (Argument("cameras", (6, 4), False), Argument("Q", (4,), True), Argument("q", (4,), True), Argument("weight", (), True), Argument("damping", (4,), False), Argument("move", (10, 4), False), ),
+        (Argument("step", (4,), True), ),
+        "step -V^-1 (g_point + W^T move) of a point for a step of the cameras, and Z Q beside W^T move for the last four rows where there are ten; damping = (plain, relative, floor, bind): V has bind Q Q^T added, then plain + relative max(V_ii, floor) on its diagonal.",
+    ),
+    "free_change": Signature(
+        "joint",
+        (Argument("cameras", (6, 4), False), Argument("Q", (4,), True), Argument("weight", (), True), Argument("move", (10, 4), False), Argument("step", (4,), True), ),
+        (Argument("squared_change", (), False), ),
+        "w |J step|^2 for a step of the cameras (move) and of the point.",
+    ),
+    "normalized_reduced": Signature(
+        "joint",
+        (Argument("cameras", (6, 4), False), Argument("Q", (4,), True), Argument("q", (4,), True), Argument("weight", (), True), Argument("damping", (4,), False), ),
+        (Argument("left", (65,), True), Argument("right", (14,), True), ),
+        "factors of the Schur complement U - W V^-1 W^T = L x Q Q^T and of the gradient g - W V^-1 g_point = e x Q: left = (upper triangle of L, e), right = (upper triangle of Q Q^T, Q); damping = (plain, relative, floor, bind): V has bind Q Q^T added, then plain + relative max(V_ii, floor) on its diagonal. The last four rows are those of Z.",
+    ),
+    "factor_products": Signature(
+        "joint",
+        (Argument("factor", (), True), Argument("right", (10,), True), ),
+        (Argument("sums", (10,), False), ),
+        "an entry of the factors L or e times the products of its points' coordinates.",
+    ),
+    "factor_points": Signature(
+        "joint",
+        (Argument("factor", (), True), Argument("right", (4,), True), ),
+        (Argument("sums", (4,), False), ),
+        "an entry of the factors L or e times its points.",
     ),
     "loss_huber": Signature(
         "losses",

@@ -44,13 +44,13 @@ typedef struct {
     ptrdiff_t loss;          /* 0 linear, 1 huber, 2 soft_l1, 3 cauchy, 4 truncated */
 } eg_bundle;
 
-/* The reduced system: block row k holds the blocks from column first[k] to k, each of a rows; row r
-   of block row k begins at S + base[k] + r stride[k]. */
+/* The lower triangle of the reduced system in blocks of 12x12: block row k holds those from column
+   first[k] to k, as one panel of twelve rows; entry (r, c) of the l-th of all blocks is at
+   144 l + 12 c + r. */
 typedef struct {
-    ptrdiff_t n, a;
+    ptrdiff_t n;
     const int32_t *first;
-    const ptrdiff_t *slot;   /* (n + 1): number of the first block of each row */
-    const ptrdiff_t *base, *stride;
+    const ptrdiff_t *slot; /* (n + 1): number of the first block of each row */
 } eg_envelope;
 
 /* ---------------------------------------------------------------- bundle.c */
@@ -107,5 +107,27 @@ EG_EXPORT void eg_envelope_solve(
     const eg_envelope *envelope, const double *S, ptrdiff_t count, double *x);
 
 EG_EXPORT void eg_bundle_neighbours(const eg_bundle *bundle, unsigned char *together);
+
+/* ---------------------------------------------------------------- bundle_start.c */
+
+EG_EXPORT int eg_bundle_intersect(
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *P, double *Q);
+
+EG_EXPORT int eg_bundle_distances(
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *P, const double *Q,
+    const ptrdiff_t *first, double *distances);
+
+EG_EXPORT int eg_spreading_basis(ptrdiff_t m, const double *Q, double *T);
+
+EG_EXPORT int eg_resect(
+    ptrdiff_t count, const double *q, const double *Q, double scale2, double ftol,
+    ptrdiff_t max_iter, double *P);
+
+/* ---------------------------------------------------------------- bundle_step.c */
+
+EG_EXPORT int eg_bundle_step(
+    const eg_bundle *bundle, const eg_envelope *envelope, const double *P, const double *Q,
+    const double *U, const double *V, const double *g_cameras, const double *g_points,
+    const double *W_cameras, const double *W_points, double lam, double *step, double *energy);
 
 #endif

@@ -92,21 +92,14 @@ static void add_to_pairs(const eg_chunk *chunk, const eg_envelope *envelope, ptr
                          const double *EG_RESTRICT X, const double *EG_RESTRICT moments,
                          double *pairs)
 {
-    double *sum = filled ? pair_of(envelope, rows[0], columns[0], pairs) : 0;
     for (ptrdiff_t begin = 0, end; begin < filled; begin = end) {
-        const int32_t row = rows[begin], column = columns[begin];
         for (end = begin + 1; end < filled; ++end)
-            if (rows[end] != row || columns[end] != column)
+            if (rows[end] != rows[begin] || columns[end] != columns[begin])
                 break;
-        double *next = end < filled ? pair_of(envelope, rows[end], columns[end], pairs) : 0;
-#ifdef __GNUC__
-        for (ptrdiff_t line = 0; next && line < EG_PAIR; line += 8)
-            __builtin_prefetch(next + line, 1);
-#endif
+        double *sum = pair_of(envelope, rows[begin], columns[begin], pairs);
         for (int e = 0; sum && e < 9; e += 3)
             eg_accumulate(end - begin, X + begin + e * chunk->M, chunk->M, moments + 16 * begin,
                           sum + 8 * e, sum + 9 * 8 + 4 * e);
-        sum = next;
     }
 }
 

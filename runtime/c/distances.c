@@ -80,22 +80,21 @@ static void block_distances(const eg_matches *matches, const eg_options *options
         squared[i] = d[i] * d[i];
 }
 
-static void losses(const eg_options *options, ptrdiff_t n, const double *squared, double *value,
-                   double *first, double *second)
+void eg_losses(int loss, double scale2, ptrdiff_t n, const double *squared, double *value,
+               double *first, double *second)
 {
-    const double *scale2 = &options->loss_scale2;
-    switch (options->loss) {
+    switch (loss) {
     case EG_HUBER:
-        eg_loss_huber(n, squared, scale2, value, first, second);
+        eg_loss_huber(n, squared, &scale2, value, first, second);
         break;
     case EG_SOFT_L1:
-        eg_loss_soft_l1(n, squared, scale2, value, first, second);
+        eg_loss_soft_l1(n, squared, &scale2, value, first, second);
         break;
     case EG_CAUCHY:
-        eg_loss_cauchy(n, squared, scale2, value, first, second);
+        eg_loss_cauchy(n, squared, &scale2, value, first, second);
         break;
     case EG_TRUNCATED:
-        eg_loss_truncated(n, squared, scale2, value, first, second);
+        eg_loss_truncated(n, squared, &scale2, value, first, second);
         break;
     default:
         for (ptrdiff_t i = 0; i < n; ++i) {
@@ -115,7 +114,8 @@ double eg_distances(eg_matches *matches, const eg_options *options, const double
         const double *weights = matches->weights + begin;
         double part = 0.0;
         block_distances(matches, options, F, &frame, begin, n, squared);
-        losses(options, n, squared, value, first, second);
+        eg_losses(options->loss, options->loss_scale2, n, squared, value, first, second);
+        EG_SUM(part)
         for (ptrdiff_t i = 0; i < n; ++i)
             part += weights[i] * value[i];
         sum += part;
@@ -131,7 +131,7 @@ static void block_weights(const eg_matches *matches, const eg_options *options, 
     const double *weights = matches->weights + begin, *d = matches->d + begin;
     for (ptrdiff_t i = 0; i < n; ++i)
         squared[i] = d[i] * d[i];
-    losses(options, n, squared, value, first, second);
+    eg_losses(options->loss, options->loss_scale2, n, squared, value, first, second);
     for (ptrdiff_t i = 0; i < n; ++i) {
         weight[i] = weights[i] * first[i];
         curvature[i] = 2.0 * weights[i] * second[i];

@@ -68,9 +68,9 @@ static void retract(const eg_options *options, const eg_chart *chart, const doub
         eg_block_retract(1, motion, motion + 9, motion + 18, delta, moved, moved + 9, moved + 18);
 }
 
-/* Gradient, Hessian and diagonal of J^T J by the parameters (chain rule). */
-static void linearize(eg_matches *matches, const eg_options *options, const eg_chart *chart,
-                      const double *motion, eg_outcome *state)
+/* Gradient, Hessian and diagonal of J^T J by the p parameters. */
+static inline void chain_rule(int p, eg_matches *matches, const eg_options *options,
+                              const eg_chart *chart, const double *motion, eg_outcome *state)
 {
     double g[9], H[81], own[9], dF[63], d2F[441], DF[63], HD[63], second[49];
     eg_normal(matches, options, state->F, g, state->normal, H);
@@ -88,7 +88,6 @@ static void linearize(eg_matches *matches, const eg_options *options, const eg_c
     }
     if (options->exact)
         eg_transposed_product(1, 9, 49, inner, d2F, second);
-    const int p = chart->p;
     if (chart->basis) {
         double half[49];
         eg_product(9, 7, p, dF, chart->basis, DF);
@@ -116,6 +115,16 @@ static void linearize(eg_matches *matches, const eg_options *options, const eg_c
     if (options->exact)
         for (int k = 0; k < p * p; ++k)
             state->hessian[k] += second[k];
+}
+
+/* Compiled for the usual number of parameters, and for any. */
+static void linearize(eg_matches *matches, const eg_options *options, const eg_chart *chart,
+                      const double *motion, eg_outcome *state)
+{
+    if (chart->p == 7)
+        chain_rule(7, matches, options, chart, motion, state);
+    else
+        chain_rule(chart->p, matches, options, chart, motion, state);
 }
 
 static double largest(const eg_outcome *state, int p)
@@ -275,6 +284,7 @@ void eg_minimize(eg_matches *matches, const eg_options *options, const eg_chart 
                  double *motion, double *history, eg_outcome *outcome)
 {
     double total = 0.0;
+    EG_SUM(total)
     for (ptrdiff_t i = 0; i < matches->m; ++i)
         total += matches->weights[i];
     memset(outcome, 0, sizeof *outcome);

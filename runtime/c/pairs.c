@@ -44,6 +44,7 @@ static int centre(ptrdiff_t m, const double *x, const double *weights, double *o
 {
     double sx = 0.0, sy = 0.0, size = 0.0;
     ptrdiff_t n = 0;
+    EG_SUM(sx, sy, n)
     for (ptrdiff_t i = 0; i < m; ++i)
         if (counts(weights, i)) {
             sx += x[2 * i];
@@ -55,6 +56,7 @@ static int centre(ptrdiff_t m, const double *x, const double *weights, double *o
     origin[0] = sx / (double)n;
     origin[1] = sy / (double)n;
     double xx = 0.0, xy = 0.0, yy = 0.0, total = 0.0;
+    EG_SUM(xx, xy, yy, total)
     for (ptrdiff_t i = 0; i < m; ++i) {
         const double a = x[2 * i] - origin[0], b = x[2 * i + 1] - origin[1];
         total += a + b; /* NaN and infinity of matches that do not count, too */

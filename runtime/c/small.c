@@ -41,12 +41,20 @@ void eg_cholesky_solve(int p, const double *L, double *x)
     }
 }
 
+/* The tangent of the smaller angle whose rotation annuls `off`, which is not zero; `half` is half
+   the difference of the diagonal entries. Not by hypot: its newer version would tie the library to
+   glibc 2.35. */
+static double tangent(double half, double off)
+{
+    const double ratio = half / off;
+    return copysign(1.0, ratio) / (fabs(ratio) + sqrt(1.0 + ratio * ratio));
+}
+
 /* One Jacobi rotation of rows and columns i and j. */
 static void rotate(int p, double *A, double *vectors, int i, int j)
 {
     const double off = A[i * p + j];
-    const double half = 0.5 * (A[j * p + j] - A[i * p + i]);
-    const double t = copysign(1.0, half) * off / (fabs(half) + hypot(half, off));
+    const double t = tangent(0.5 * (A[j * p + j] - A[i * p + i]), off);
     const double c = 1.0 / sqrt(1.0 + t * t), s = t * c;
     for (int k = 0; k < p; ++k) {
         const double a = A[k * p + i], b = A[k * p + j];
@@ -127,8 +135,7 @@ int eg_factorize(const double *F, double *U, double *V, double *sigma)
                 const double aii = dot3(a[i], a[i]), ajj = dot3(a[j], a[j]), aij = dot3(a[i], a[j]);
                 if (!(fabs(aij) > 2.0 * DBL_EPSILON * sqrt(aii * ajj)))
                     continue;
-                const double half = 0.5 * (ajj - aii);
-                const double t = copysign(1.0, half) * aij / (fabs(half) + hypot(half, aij));
+                const double t = tangent(0.5 * (ajj - aii), aij);
                 const double c = 1.0 / sqrt(1.0 + t * t), s = t * c;
                 for (int k = 0; k < 3; ++k) {
                     const double x = a[i][k], y = v[i][k];

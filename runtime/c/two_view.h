@@ -10,6 +10,14 @@
 /* Matches are kept and worked on in blocks, so that all between two passes stays in the cache. */
 #define EG_BLOCK 256
 
+/* Before a loop that adds up: in the lanes of a vector, hence not one by one. */
+#if defined(_MSC_VER)
+#define EG_SUM(...)
+#else
+#define EG_PRAGMA(text) _Pragma(#text)
+#define EG_SUM(...) EG_PRAGMA(omp simd reduction(+ : __VA_ARGS__))
+#endif
+
 /* Numbers of the choices, as _native.py has them. */
 enum { EG_REPROJECTION, EG_SAMPSON, EG_EPIPOLAR };
 enum { EG_ORTHO, EG_BLOCKS };
@@ -54,6 +62,10 @@ typedef struct {
 
 /* iteration, cost, lambda, length of the step, accepted, seconds */
 #define EG_ROW 6
+
+/* Loss of squared residuals with its first two derivatives. */
+void eg_losses(int loss, double scale2, ptrdiff_t n, const double *squared, double *value,
+               double *first, double *second);
 
 double *eg_block_points(const eg_matches *matches, ptrdiff_t begin);
 

@@ -164,7 +164,13 @@ class Arrow:
         return float(np.median(np.einsum("mkk->mk", self.V)))
 
     def solve(self, lam: float, *, scaled: bool) -> Array:
-        """Solve by the Schur complement of the points; the border by Woodbury's identity."""
+        """Solve by the Schur complement of the points; the border by Woodbury's identity.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If a point's block or the complement is singular to rounding.
+        """
         p, k = len(self.U), self.V.shape[1]
         if scaled:
             # A match of weight zero leaves zeros on the diagonal, which no factor would lift.
@@ -178,6 +184,8 @@ class Arrow:
         inverse = np.linalg.inv(V)
         Y = self.W @ inverse
         reduced = U - np.einsum("mpk,mqk->pq", Y, self.W)
+        if not np.isfinite(reduced).all():
+            raise np.linalg.LinAlgError("the block of a point is singular")
 
         def apply(motion: Array, points: Array) -> Array:
             """Apply the inverse to right-hand sides (p, r) and (m, k, r)."""

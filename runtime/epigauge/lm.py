@@ -51,6 +51,9 @@ STATUS = {
 
 _LAM_CEILING = 1e16
 
+#: Most trial steps: the compiled loop keeps a row for each.
+_MAX_ITER = 1_000_000
+
 
 class State(Protocol):
     """What a problem knows about one estimate; at least its cost, 0.5 * sum of squares."""
@@ -167,7 +170,7 @@ class Stopping:
     gtol : float
         Largest absolute entry of the gradient.
     max_iter : int
-        Trial steps, accepted or rejected.
+        Trial steps, accepted or rejected; from 1 to 1,000,000.
     """
 
     ftol: float = 1e-10
@@ -181,8 +184,9 @@ class Stopping:
             if not (isinstance(value, float | int | np.floating) and 0.0 <= value < 1.0):
                 raise ArgumentError(name, f"is {value!r}", "a number in [0, 1)")
         count = isinstance(self.max_iter, int | np.integer) and not isinstance(self.max_iter, bool)
-        if not count or self.max_iter < 1:
-            raise ArgumentError("max_iter", f"is {self.max_iter!r}", "an integer of at least 1")
+        if not count or not 1 <= self.max_iter <= _MAX_ITER:
+            needed = f"an integer of at least 1, at most {_MAX_ITER}"
+            raise ArgumentError("max_iter", f"is {self.max_iter!r}", needed)
 
 
 @dataclass(frozen=True)
@@ -293,6 +297,10 @@ def minimize(
         counts = (len(history), njev, iteration)
         return Outcome(state, system, *counts, status, tuple(history))
 
+    def too_large(lam: float) -> bool:
+        # Not `>`: lam has outgrown a ceiling that is infinite or NaN, too.
+        return not lam <= min(_LAM_CEILING * max(system.largest(), 1e-300), 1e300)
+
     if stop:
         return outcome(-2)
     if not math.isfinite(state.cost):
@@ -304,7 +312,6 @@ def minimize(
             return outcome(1)
         if system.decrement() <= stopping.ftol * state.cost:
             return outcome(4)
-        ceiling = _LAM_CEILING * max(system.largest(), 1e-300)
         while True:
             if iteration >= stopping.max_iter:
                 return outcome(0)
@@ -312,7 +319,7 @@ def minimize(
                 step = damping.step(system, lam)
             except np.linalg.LinAlgError:  # singular to rounding: more damping
                 lam = schedule.rejected(lam)
-                if lam > ceiling:
+                if too_large(lam):
                     return outcome(-1)
                 continue
             iteration += 1
@@ -328,7 +335,7 @@ def minimize(
             if abs(decrease) <= 1e-15 * state.cost:
                 return outcome(2)
             lam = schedule.rejected(lam)
-            if lam > ceiling:
+            if too_large(lam):
                 return outcome(-1)
         predicted = system.predicted(step)
         lam = schedule.accepted(lam, decrease / predicted if predicted > 0.0 else 1.0)

@@ -39,6 +39,13 @@ def pool(values, batch, rng):
     return np.stack(chosen, axis=-1).reshape(own + batch) if count else np.empty(own + batch)
 
 
+def definite(batch, rng):
+    """Return upper triangles of positive definite 4x4 matrices."""
+    root = rng.standard_normal((*batch, 4, 6))
+    upper = (root @ root.swapaxes(-1, -2))[..., *np.triu_indices(4)]
+    return np.moveaxis(upper, -1, 0)
+
+
 def inputs(name, batch, seed, F=None):
     """Return arguments of a kernel, in general position and near the hard places.
 
@@ -49,6 +56,7 @@ def inputs(name, batch, seed, F=None):
     signature = SIGNATURES[name]
     count = int(np.prod(batch))
     each = any(argument.name == "R1" and argument.batched for argument in signature.inputs)
+    lam_each = any(argument.name == "lam" and argument.batched for argument in signature.inputs)
     if F is None:
         cases = list(fundamental_cases(seed).values())
         F = pool(cases, batch, rng) if each else cases[seed % len(cases)]
@@ -73,6 +81,11 @@ def inputs(name, batch, seed, F=None):
         "weight": lambda: rng.uniform(0.0, 2.0, batch),
         "squared": lambda: rng.uniform(0.0, 3.0, batch),
         "scale2": lambda: 0.7,
+        "eta": lambda: 0.3,
+        "damping": lambda: np.array([0.3, 0.2, 0.5, 0.4]),
+        "N": lambda: definite(batch, rng),
+        "W": lambda: definite(batch, rng),
+        "lam": lambda: rng.uniform(0.0, 1.0, batch if lam_each else ()),
     }
     wanted = {argument.name for argument in signature.inputs}
     if wanted >= set(FRAME):
@@ -145,6 +158,12 @@ def test_backends_agree_on_the_matches_of_every_f(name, case):
     for other, tolerance in (("c", 1e-13 if name in SUMMED else 0.0), ("casadi", 1e-11)):
         if kernels.available()[other] is None:
             compare(name, kernels.table(other), arguments, tolerance)
+
+
+@pytest.mark.parametrize("name", MATCHED)
+def test_c_is_numpy_over_many_chunks(name):
+    # C keeps intermediate results of at most 256 matches between the loops of a kernel.
+    compare(name, backend("c"), inputs(name, (600,), 12), 1e-13 if name in SUMMED else 0.0)
 
 
 @pytest.mark.parametrize("name", sorted(set(SIGNATURES) - SUMMED))

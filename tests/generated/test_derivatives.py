@@ -425,8 +425,35 @@ def test_hessian_is_gauss_newton_where_the_distances_are_zero(case):
     assert distance(H, N) <= 1e-12
 
 
+LOSSES = [name for name, s in SIGNATURES.items() if s.family == "losses"]
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_loss_derivatives(name):
+    # On both sides of the scale, none on it, where the second derivative may jump.
+    squared = np.array([0.02, 0.3, 0.65, 0.75, 1.3, 9.0])
+    _, first, second = getattr(K, name)(squared, 0.7)
+    assert_jacobian(lambda s: getattr(K, name)(s, 0.7)[0], squared, np.diag(first))
+    assert_jacobian(lambda s: getattr(K, name)(s, 0.7)[1], squared, np.diag(second))
+
+
+@pytest.mark.parametrize("eta", [0.0, 0.05, 0.9, 1.0])
+def test_pseudo_object_space_derivatives(eta):
+    rng = np.random.default_rng(12)
+    P, X, q = rng.standard_normal((3, 4)), rng.standard_normal(3), rng.standard_normal(2)
+    r, J_P, J_X = K.pseudo_object_space(eta, P, X, q)
+    h = P @ [*X, 1.0]
+    parts = np.sqrt(1.0 - eta) * (h[:2] - h[2] * q), np.sqrt(eta) * (h[:2] - q)
+    np.testing.assert_allclose(r, np.concatenate(parts), rtol=0.0, atol=1e-14)
+
+    assert_jacobian(lambda x: K.pseudo_object_space(eta, x, X, q)[0], P, J_P.reshape(4, 3, 4))
+    assert_jacobian(lambda x: K.pseudo_object_space(eta, P, x, q)[0], X, J_X)
+
+
 def test_every_derivative_is_checked_here():
     checked = {
+        *LOSSES,
+        "pseudo_object_space",
         "rotation_derivatives",
         "fundamental_derivatives",
         "canonical_camera_derivatives",
@@ -448,5 +475,7 @@ def test_every_derivative_is_checked_here():
     values = {"r", "F", "P2", "R", "U_new", "V_new", "M_new", "sigma_new", "q_hat", "depth"}
     values |= {"R1", "R2", "s", "b1", "b2", "f", "multiplier", "last_change", "d", "e"}
     derived = {n for n, s in SIGNATURES.items() if {a.name for a in s.outputs} - values}
+    # Parts of normal equations: test_bundle.py, test_joint.py compare them with their definition.
+    derived -= {name for name, s in SIGNATURES.items() if s.family in ("bundle", "joint")}
     # A kernel of one F each is compared with the one of a shared F in test_backends.py.
     assert {name.removesuffix("_each") for name in derived} - checked == set()

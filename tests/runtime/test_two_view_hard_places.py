@@ -251,7 +251,7 @@ class TestHonesty:
         result = eg.refine_fundamental(x1, x2, view.F_true, max_iter=300)
         joint = eg.refine_fundamental(x1, x2, view.F_true, structure="joint", max_iter=300)
         assert result.success
-        # The match in question has no derivative there: which minimum is met is a matter of rounding.
+        # The match in question has no derivative there: rounding decides which minimum is met.
         assert result.cost <= joint.cost * (1.0 + 1e-8)
 
     def test_sampson_distance_on_both_epipoles_is_zero(self) -> None:

@@ -8,9 +8,11 @@ library that was built from other formulas.
 from __future__ import annotations
 
 import hashlib
+import math
 
 import sympy as sp
 
+from epigauge_derive.emitters._staged import Part, parts
 from epigauge_derive.emitters._text import (
     families,
     file_header,
@@ -30,6 +32,11 @@ _printer = Printer(
 # Loops up to this many statements are unrolled inside the SIMD loop; longer ones run one
 # observation at a time.
 _UNROLL = 200
+
+# A staged kernel keeps intermediate results of a chunk of observations between its loops: so many
+# doubles, that they stay in the nearest cache. It adds up so many sums in one of these loops, few
+# enough for the registers.
+_KEPT, _CHUNK, _SUMS = 4096, 256, 18
 
 _HEADER = """#ifndef EPIGAUGE_KERNELS_H
 #define EPIGAUGE_KERNELS_H
@@ -96,18 +103,31 @@ def _pointer(argument: Input) -> str:
 
 
 def _function(program: Program) -> str:
+    body = _staged_body(program) if program.kernel.staged else _body(program)
+    return "\n".join([*_head(program), *body, "}"]) + "\n"
+
+
+def _head(program: Program) -> list[str]:
+    """Return comment, prototype and shared inputs."""
     kernel = program.kernel
     lines = ["", f"/* {kernel_header(program)[0]}"]
     lines += [f"   {line}" for line in kernel_header(program)[1:]]
     lines[-1] += " */"
     lines += [_prototype(kernel), "{"]
-    sums = _sums(program)
     for argument in kernel.inputs:
         if not used_entries(program, argument):
             lines.append(f"    (void){_pointer(argument)};")
         if argument.shared:
             for position, _, name in used_entries(program, argument):
                 lines.append(f"    const double {name} = {_pointer(argument)}[{position}];")
+    return lines
+
+
+def _body(program: Program) -> list[str]:
+    """Return one loop over the observations."""
+    kernel = program.kernel
+    lines = []
+    sums = _sums(program)
     for name in sums.values():
         lines.append(f"    double {name} = 0.0;")
     for output, results in zip(kernel.outputs, program.results, strict=True):
@@ -142,7 +162,58 @@ def _function(program: Program) -> str:
         if output.summed:
             for position, expression in enumerate(results):
                 lines.append(f"    {output.name}[{position}] = {sums[expression]};")
-    return "\n".join([*lines, "}"]) + "\n"
+    return lines
+
+
+def _staged_body(program: Program) -> list[str]:
+    """Return a loop over chunks of the observations, and in it one for each part."""
+    cut = parts(program, _SUMS)
+    kept = sorted({symbol.name for part in cut for symbol in part.keeps})
+    chunk = min(_CHUNK, 2 ** int(math.log2(_KEPT / max(len(kept), 1))))
+    lines, copies = [], []
+    first: dict[sp.Expr, str] = {}
+    for output, results in zip(program.kernel.outputs, program.results, strict=True):
+        if not output.summed:
+            continue
+        lines.append(f"    memset({output.name}, 0, {len(results)} * sizeof(double));")
+        for position, expression in enumerate(results):
+            place = f"{output.name}[{position}]"
+            if first.setdefault(expression, place) != place:
+                copies.append(f"    {place} = {first[expression]};")
+    lines.append(f"    for (ptrdiff_t begin = 0; begin < n; begin += {chunk}) {{")
+    lines.append(f"        const ptrdiff_t end = n - begin < {chunk} ? n : begin + {chunk};")
+    lines += [f"        double kept_{name}[{chunk}];" for name in kept]
+    for part in cut:
+        lines += [line if line.startswith("#") else f"    {line}" for line in _part(program, part)]
+    return [*lines, "    }", *copies]
+
+
+def _part(program: Program, part: Part) -> list[str]:
+    """Return one loop of a staged kernel."""
+    names = [f"sum_{output}{position}" for output, position, _ in part.sums]
+    lines = ["    {", *(f"    double {name} = 0.0;" for name in names)] if names else []
+    lines += [*_pragma(names).split("\n"), "    for (ptrdiff_t i = begin; i < end; ++i) {"]
+    kept = {symbol.name for symbol in part.reads}
+    for argument in program.kernel.inputs:
+        loads = _loads(program, argument)
+        for (*_, name), load in zip(used_entries(program, argument), loads, strict=True):
+            lines += [load] if name in kept and not argument.shared else []
+            kept.discard(name)
+    # A state of a loop is assigned more than once: nothing here is const.
+    lines += [f"        double {name} = kept_{name}[i - begin];" for name in sorted(kept)]
+    for symbol, expression in part.assignments:
+        kind = "" if symbol.name in kept else "double "
+        lines.append(f"        {kind}{symbol.name} = {_printer(expression)};")
+        kept.add(symbol.name)
+    lines += [f"        kept_{symbol.name}[i - begin] = {symbol.name};" for symbol in part.keeps]
+    for output, position, expression in part.values:
+        lines.append(f"        {output}[{_place(position)}] = {_printer(expression)};")
+    for name, (*_, expression) in zip(names, part.sums, strict=True):
+        lines.append(f"        {name} += {_printer(expression)};")
+    lines.append("    }")
+    for name, (output, position, _) in zip(names, part.sums, strict=True):
+        lines.append(f"    {output}[{position}] += {name};")
+    return [*lines, "    }"] if names else lines
 
 
 def _sums(program: Program) -> dict[sp.Expr, str]:

@@ -10,11 +10,25 @@ from __future__ import annotations
 
 import sympy as sp
 
-from epigauge_derive.kernel import Input, Kernel, Let, Output, at, jacobian, upper
+from epigauge_derive.kernel import (
+    Input,
+    Kernel,
+    Let,
+    Loop,
+    Output,
+    at,
+    jacobian,
+    select,
+    upper,
+)
 
 P, Q, MEASURED, WEIGHT = Input("P", (3, 4)), Input("Q", (4,)), Input("q", (2,)), Input("weight")
 T = Input("T", (4, 4))
-V, W, G, LAM = Input("V", (10,)), Input("W", (10,)), Input("g", (4,)), Input("lam")
+
+#: Squarings of an inverse 4x4 matrix, and what is added to its diagonal, relative to the trace.
+_SQUARINGS, _SHIFT = 8, 1e-13
+
+N, W, G, LAM = Input("N", (10,)), Input("W", (10,)), Input("g", (4,)), Input("lam")
 
 
 def kernels() -> list[Kernel]:
@@ -54,7 +68,7 @@ def _observation() -> list[Kernel]:
             "|q - q_hat|^2.",
             (P, Q, MEASURED, WEIGHT),
             (
-                Output.of("V", upper(weight * J_Q.T * J_Q)),
+                Output.of("N", upper(weight * J_Q.T * J_Q)),
                 Output.of("D", upper(weight * Z_Q.T * Z_Q)),
                 Output.of("g", -weight * J_Q.T * r),
                 squared,
@@ -64,8 +78,9 @@ def _observation() -> list[Kernel]:
         Kernel(
             "camera_normal",
             "the factors of what an observation adds to its camera's normal equations: "
-            "J_P^T J_P = A x Q Q^T (A: upper triangle of 3x3, with weight), Z_P^T Z_P = depth Q Q^T "
-            "for the last row of P and zero for the others, -w J_P^T (q - q_hat) = e x Q.",
+            "J_P^T J_P = A x Q Q^T (A: upper triangle of 3x3, with weight), "
+            "Z_P^T Z_P = depth Q Q^T for the last row of P and zero for the others, "
+            "-w J_P^T (q - q_hat) = e x Q.",
             (P, Q, MEASURED, WEIGHT),
             (
                 Output.of("A", upper(weight * a.T * a)),
@@ -73,6 +88,13 @@ def _observation() -> list[Kernel]:
                 Output.of("e", -weight * a.T * r),
             ),
             (image,),
+        ),
+        Kernel(
+            "sight_normal",
+            "what a line of sight adds to its point's homogeneous equations: sum of w n n^T over "
+            "the two unit normals n ~ q_k p3 - p_k (upper triangle).",
+            (P, MEASURED, WEIGHT),
+            (Output.of("N", upper(weight * _planes())),),
         ),
         Kernel(
             "coupling",
@@ -83,6 +105,55 @@ def _observation() -> list[Kernel]:
             (image,),
         ),
     ]
+
+
+def _planes() -> sp.Matrix:
+    """Return the sum of n n^T / n^T n over the two planes of a line of sight."""
+    total = sp.zeros(4, 4)
+    for k, coordinate in enumerate(MEASURED.entries()):
+        plane = (coordinate * P.matrix()[2, :] - P.matrix()[k, :]).T
+        total += plane * plane.T / (plane.T * plane)[0]
+    return total
+
+
+def _least_eigenvector() -> Kernel:
+    """Return the unit eigenvector of N to its least eigenvalue.
+
+    N^-1 is squared until only one eigenvalue is left: the columns are then multiples of the vector,
+    of which the longest is taken. A shift of rounding size keeps a singular N invertible.
+    """
+    N_matrix = _symmetric(N.entries())
+    values: dict[sp.Symbol, sp.Expr] = {}
+    trace = sp.Symbol("trace", real=True)
+    values[trace] = N_matrix.trace()
+    shifted = N_matrix / trace + sp.Float(_SHIFT) * sp.eye(4)
+    across = _cholesky("L", shifted, values)
+    inverse = across.T * across
+    power = _symmetric([sp.Symbol(f"power{k}", real=True) for k in range(10)])
+    size = sp.Symbol("size", real=True)
+    scaled = power / size
+    squares = Loop(
+        start=dict(zip(upper(power), upper(inverse), strict=True)),
+        body={size: power.trace()},
+        update=dict(zip(upper(power), upper(scaled * scaled), strict=True)),
+        passes=_SQUARINGS,
+    )
+    column = [power[i, 0] for i in range(4)]
+    longest = power[0, 0]
+    for k in range(1, 4):
+        longer = power[k, k] - longest
+        column = [select(longer, power[i, k], column[i]) for i in range(4)]
+        longest = select(longer, power[k, k], longest)
+    names = sp.symbols("x0:4", real=True)
+    length = sp.sqrt(sum(name**2 for name in names))
+    return Kernel(
+        "least_eigenvector",
+        "unit eigenvector of N (upper triangle) to its least eigenvalue, by squaring N^-1 "
+        f"{_SQUARINGS} times.",
+        (N,),
+        (Output.of("X", [name / length for name in names]),),
+        (Let(values), squares, Let(dict(zip(names, column, strict=True)))),
+    )
 
 
 def _symmetric(entries: list[sp.Symbol]) -> sp.Matrix:
@@ -117,47 +188,48 @@ def _cholesky(name: str, matrix: sp.Matrix, values: dict[sp.Symbol, sp.Expr]) ->
 
 
 def _point() -> list[Kernel]:
-    V_matrix, W_matrix = (_symmetric(argument.entries()) for argument in (V, W))
+    N_matrix, W_matrix = (_symmetric(argument.entries()) for argument in (N, W))
     lam, g = LAM.symbol(), G.matrix()
     plain: dict[sp.Symbol, sp.Expr] = {}
-    root = _cholesky("L", V_matrix, plain).T
+    root = _cholesky("L", N_matrix, plain).T
 
     # Whitened first: where W = 1 the condition is about 1 / lam whatever the basis.
     values: dict[sp.Symbol, sp.Expr] = {}
     across = _cholesky("L", W_matrix, values)
-    product = across * V_matrix * across.T
+    product = across * N_matrix * across.T
     white = sp.zeros(4, 4)
     for i in range(4):
         for j in range(i, 4):
-            symbol = sp.Symbol(f"N{i}{j}", real=True)
+            symbol = sp.Symbol(f"white{i}{j}", real=True)
             values[symbol] = product[i, j]
             white[i, j] = white[j, i] = symbol
     damped_root = across.T * _cholesky("M", white + lam * sp.eye(4), values).T
 
     own: dict[sp.Symbol, sp.Expr] = {}
-    inverse = _cholesky("L", V_matrix + lam * (V_matrix + W_matrix), own)
+    inverse = _cholesky("L", N_matrix + lam * (N_matrix + W_matrix), own)
     half = sp.Matrix(sp.symbols("y0:4", real=True))
     own |= dict(zip(half, inverse * g, strict=True))
     return [
+        _least_eigenvector(),
         Kernel(
             "inverse_root",
-            "upper triangular T with T T^T = V^-1, from the upper triangle of V.",
-            (V,),
+            "upper triangular T with T T^T = N^-1, from the upper triangle of N.",
+            (N,),
             (Output.of("T", root),),
             (Let(plain),),
         ),
         Kernel(
             "damped_inverse_root",
-            "upper triangular T with T T^T = (V + lam W)^-1, found where W = 1; upper triangles.",
-            (V, W, Input("lam", (), shared=True)),
+            "upper triangular T with T T^T = (N + lam W)^-1, found where W = 1; upper triangles.",
+            (N, W, Input("lam", (), shared=True)),
             (Output.of("T", damped_root),),
             (Let(values),),
         ),
         Kernel(
             "point_step",
-            "a point's own damped step -(V + lam (V + W))^-1 g and the decrease of the cost that "
-            "it promises at most, g^T (V + lam (V + W))^-1 g; upper triangles.",
-            (V, W, G, LAM),
+            "a point's own damped step -(N + lam (N + W))^-1 g and the decrease of the cost that "
+            "it promises at most, g^T (N + lam (N + W))^-1 g; upper triangles.",
+            (N, W, G, LAM),
             (
                 Output.of("step", -inverse.T * half),
                 Output.of("promised", (half.T * half)[0]),

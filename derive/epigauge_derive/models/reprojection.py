@@ -14,6 +14,7 @@ global correction. Newton from l = 0 starts with the Sampson correction.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import sympy as sp
@@ -40,10 +41,16 @@ MULTIPLIER = Input("l")
 
 # Newton passes behind the first, which is the Sampson correction.
 FAST_PASSES, MORE_PASSES, SAFE_PASSES = 2, 8, 100
-# The bracket ends this far (relative) inside the poles +-1 / s1, so that nothing divides by zero.
+# Up to this much of the way to the poles +-1 / s1, sums over a common denominator lose no digit.
+_FAR_FROM_POLES = sp.Rational(1, 2)
+# The bracket ends this far (relative) inside the poles, so that nothing divides by zero.
 _INSIDE = 1 - sp.Rational(1, 2**46)
 # Keeps 0/0 out of matches that lie on both epipoles, where C and its gradient vanish together.
 _TINY = sp.Float("1e-300")
+
+
+Term = Callable[[sp.Expr, sp.Expr], sp.Expr]
+Names = dict[sp.Symbol, sp.Expr]
 
 
 def _symbols(*names: str) -> list[sp.Symbol]:
@@ -54,6 +61,9 @@ A1, A2 = _symbols("a1_0", "a1_1"), _symbols("a2_0", "a2_1")
 C0 = sp.Symbol("C0", real=True)
 SQUARES = _symbols("hh0", "hh1", "hh2", "hh3")
 RECIPROCALS = _symbols("r0", "r1", "r2", "r3")
+# Sum and half the difference of the h^2 of kappa = +-s1 and of kappa = +-s2, and 1 - (l s)^2.
+SUMS, DIFFERENCES = _symbols("sum0", "sum1"), _symbols("difference0", "difference1")
+DENOMINATORS = _symbols("D0", "D1")
 KAPPA = [S.entries()[0], -S.entries()[0], S.entries()[1], -S.entries()[1]]
 
 
@@ -87,21 +97,41 @@ def gradient_at_measurement() -> list[sp.Expr]:
     return diagonal_coordinates([sp.diff(bilinear(A1, A2), v) for v in z])
 
 
-def reciprocals(l: sp.Expr) -> dict[sp.Symbol, sp.Expr]:
-    """Name r = 1 / (1 + l kappa) for the four kappa, with one division for all."""
-    names: dict[sp.Symbol, sp.Expr] = {}
+def reciprocals(l: sp.Expr, over: sp.Expr = sp.S.One) -> Names:
+    """Name r = over / (1 + l kappa) for the four kappa, with one division for all."""
+    names: Names = {}
     pairs = _symbols("pair0", "pair1")
     inverse = sp.Symbol("inverse", real=True)
     for k, pair in enumerate(pairs):
         above, below = _symbols(f"above{k}", f"below{k}")
         names |= {above: 1 + l * KAPPA[2 * k], below: 1 + l * KAPPA[2 * k + 1]}
         names[pair] = above * below
-    names[inverse] = 1 / (pairs[0] * pairs[1])
+    names[inverse] = over / (pairs[0] * pairs[1])
     for k, (plus, minus) in enumerate((RECIPROCALS[:2], RECIPROCALS[2:])):
         above, below = _symbols(f"above{k}", f"below{k}")
         own = sp.Symbol(f"inverse{k}", real=True)
         names |= {own: inverse * pairs[1 - k], plus: below * own, minus: above * own}
     return names
+
+
+def phi_term(h: sp.Expr, r: sp.Expr) -> sp.Expr:
+    """Return the part of a kappa in 2 (C0 - phi) / l."""
+    return h * r + h * r * r
+
+
+def slope_term(h: sp.Expr, r: sp.Expr) -> sp.Expr:
+    """Return the part of a kappa in -phi'."""
+    return h * r * r * r
+
+
+def square_term(h: sp.Expr, r: sp.Expr) -> sp.Expr:
+    """Return the part of a kappa in the squared gradient at the foot point."""
+    return h * r * r
+
+
+def total(term: Term) -> sp.Expr:
+    """Return the sum of a term over the four kappa."""
+    return sum(term(h, r) for h, r in zip(SQUARES, RECIPROCALS, strict=True))
 
 
 def secular(l: sp.Expr) -> tuple[sp.Expr, sp.Expr]:
@@ -111,9 +141,34 @@ def secular(l: sp.Expr) -> tuple[sp.Expr, sp.Expr]:
     phi(0) = C(z) gives sum h^2 l (1 + l kappa / 2) r^2 = (l / 2) sum h^2 r (1 + r), a form without
     cancellation where kappa vanishes.
     """
-    terms = list(zip(SQUARES, RECIPROCALS, strict=True))
-    slope = sum(h * r * r * r for h, r in terms)
-    return C0 - l / 2 * sum(h * r + h * r * r for h, r in terms), slope
+    return C0 - l / 2 * total(phi_term), total(slope_term)
+
+
+def over_denominators(l: sp.Expr) -> tuple[Names, Callable[[Term, int], sp.Expr]]:
+    """Return names, and sums of a term over the four kappa times (D0 D1)^power, D = 1 - (l s)^2.
+
+    The reciprocals of kappa = +-s have the common denominator D, so that a pass needs one division.
+    What cancels near the poles is not added up apart here, as it is with the `reciprocals`.
+    """
+    u, v, D = _symbols("u0", "u1"), _symbols("v0", "v1"), DENOMINATORS
+    names: Names = {}
+    for k, s in enumerate(S.entries()):
+        names |= {u[k]: l * s, v[k]: u[k] ** 2, D[k]: 1 - v[k]}
+
+    def one(term: Term, power: int, k: int) -> sp.Expr:
+        a, b = SUMS[k], DIFFERENCES[k]
+        pair = term(a / 2 + b, 1 / (1 + u[k])) + term(a / 2 - b, 1 / (1 - u[k]))
+        over = sp.expand(sp.cancel(pair * (1 - u[k] ** 2) ** power))
+        even, odd = (
+            sp.horner(part.subs(u[k], sp.sqrt(v[k])))
+            for part in (over.coeff(a), sp.expand(over.coeff(b) / u[k]))
+        )
+        return a * even + b * u[k] * odd
+
+    def both(term: Term, power: int) -> sp.Expr:
+        return one(term, power, 0) * D[1] ** power + one(term, power, 1) * D[0] ** power
+
+    return names, both
 
 
 def _start() -> tuple[Let, sp.Symbol]:
@@ -124,11 +179,35 @@ def _start() -> tuple[Let, sp.Symbol]:
     return Let(names | {start: C0 / (sum(SQUARES) + _TINY)}), start
 
 
-def foot_point_fast(passes: int) -> tuple[tuple[Let | Loop, ...], sp.Symbol, sp.Symbol]:
-    """Return Newton's iteration for phi(l) = 0 from the Sampson correction, root and last change.
+def foot_point_fast(passes: int) -> tuple[tuple[Let | Loop, ...], sp.Symbol, sp.Symbol, sp.Expr]:
+    """Return Newton's iteration for phi(l) = 0 from the Sampson correction.
 
-    Where it leaves the interval between the poles, the change is the root itself: not found.
+    Returns the stages, the root, its last change and |n|. Where the root comes near the poles, the
+    change is the root itself: not found.
     """
+    l, change, newton, last, start = _symbols("l", "change", "newton", "last", "start")
+    gradient = [sp.diff(bilinear(A1, A2), z) for z in (*A1, *A2)]
+    names = {C0: bilinear(A1, A2)}
+    for k in (0, 1):
+        names |= {SUMS[k]: gradient[k] ** 2 + gradient[2 + k] ** 2}
+        names |= {DIFFERENCES[k]: gradient[k] * gradient[2 + k]}
+    begin = Let(rotate_match().values | names | {start: C0 / (sum(SUMS) + _TINY)})
+    shared, over = over_denominators(l)
+    D = DENOMINATORS[0] * DENOMINATORS[1]
+    phi = C0 * D**2 - l * over(lambda h, r: phi_term(h, r) / 2, 2)
+    loop = Loop(
+        start={l: start, change: sp.Integer(0)},
+        body=shared | {newton: phi * D / (over(slope_term, 3) + _TINY)},
+        update={l: l + newton, change: newton},
+        passes=passes,
+    )
+    near = select(_FAR_FROM_POLES - sp.Abs(l) * S.entries()[0], change, l)
+    length = sp.sqrt(over(square_term, 2)) / D
+    return (begin, loop, Let(shared | {last: near})), l, last, length
+
+
+def foot_point_more(passes: int) -> tuple[tuple[Let | Loop, ...], sp.Symbol, sp.Symbol, sp.Expr]:
+    """Return the same in a form that is exact up to the poles."""
     l, change, newton, last = _symbols("l", "change", "newton", "last")
     phi, slope = secular(l)
     begin, start = _start()
@@ -139,11 +218,11 @@ def foot_point_fast(passes: int) -> tuple[tuple[Let | Loop, ...], sp.Symbol, sp.
         passes=passes,
     )
     inside = Let({last: select(_INSIDE - sp.Abs(l) * S.entries()[0], change, l)})
-    return (rotate_match(), begin, loop, inside), l, last
+    return (rotate_match(), begin, loop, inside, Let(reciprocals(l))), l, last, _length()
 
 
-def foot_point_safe(passes: int) -> tuple[tuple[Let | Loop, ...], sp.Symbol, sp.Symbol]:
-    """Return the bracketed Newton iteration for phi(l) = 0, the root and its last change."""
+def foot_point_safe(passes: int) -> tuple[tuple[Let | Loop, ...], sp.Symbol, sp.Symbol, sp.Expr]:
+    """Return the same with bracketed Newton iterations."""
     l, low, high, change = _symbols("l", "low", "high", "change")
     value, step, lower, upper_, moved = _symbols("value", "step", "low_new", "high_new", "moved")
     pole = sp.Symbol("pole", real=True)
@@ -172,21 +251,28 @@ def foot_point_safe(passes: int) -> tuple[tuple[Let | Loop, ...], sp.Symbol, sp.
         update={l: moved, low: lower, high: upper_, change: moved - l},
         passes=passes,
     )
-    return (rotate_match(), begin, ends, loop), l, change
+    return (rotate_match(), begin, ends, loop, Let(reciprocals(l))), l, change, _length()
+
+
+def _length() -> sp.Expr:
+    return sp.sqrt(total(square_term))
+
+
+def half_reciprocals() -> Names:
+    """Name 1 / (2 + 2 l kappa) for the four kappa, at the multiplier that is given."""
+    return reciprocals(MULTIPLIER.symbol(), sp.Rational(1, 2))
 
 
 def stationary_point() -> tuple[list[sp.Expr], list[sp.Expr], list[sp.Expr]]:
     """Return the corrected rotated image points and the gradient of C there.
 
-    As functions of l and of the reciprocals r.
+    As functions of l and of the `half_reciprocals`: the turn into the diagonal coordinates and the
+    one back have a factor sqrt(1/2) each.
     """
     l = MULTIPLIER.symbol()
-    h = gradient_at_measurement()
-    gradient = [value * r for value, r in zip(h, RECIPROCALS, strict=True)]
-    plus1, minus1, plus2, minus2 = gradient
-    root = sp.sqrt(sp.Rational(1, 2))
-    n = [root * (plus1 + minus1), root * (plus2 + minus2)]
-    n += [root * (plus1 - minus1), root * (plus2 - minus2)]
+    turned = [sp.expand(sp.sqrt(2) * value) for value in gradient_at_measurement()]
+    plus1, minus1, plus2, minus2 = (h * r for h, r in zip(turned, RECIPROCALS, strict=True))
+    n = [plus1 + minus1, plus2 + minus2, plus1 - minus1, plus2 - minus2]
     z_hat = [z - l * entry for z, entry in zip([*A1, *A2], n, strict=True)]
     return z_hat[:2], z_hat[2:], n
 
@@ -235,11 +321,10 @@ def _foot_points() -> list[Kernel]:
     made = []
     for name, found, passes, how in (
         ("foot_point", foot_point_fast, FAST_PASSES, "Newton"),
-        ("foot_point_more", foot_point_fast, MORE_PASSES, "Newton"),
+        ("foot_point_more", foot_point_more, MORE_PASSES, "Newton"),
         ("foot_point_safe", foot_point_safe, SAFE_PASSES, "bracketed Newton"),
     ):
-        stages, l, change = found(passes)
-        norm2 = sum(h * r**2 for h, r in zip(SQUARES, RECIPROCALS, strict=True))
+        stages, l, change, length = found(passes)
         made.append(
             Kernel(
                 name,
@@ -249,9 +334,10 @@ def _foot_points() -> list[Kernel]:
                 (
                     Output.of("multiplier", l),
                     Output.of("last_change", change),
-                    Output.of("d", l * sp.sqrt(norm2)),
+                    Output.of("d", l * length),
                 ),
-                (*stages, Let(reciprocals(l))),
+                stages,
+                staged=found is foot_point_fast,
             )
         )
     return made
@@ -283,7 +369,7 @@ def _points() -> Kernel:
         (
             rotate_match(),
             Let(
-                reciprocals(MULTIPLIER.symbol())
+                half_reciprocals()
                 | dict(zip((*p1, *p2), (*q1, *q2), strict=True))
                 | {length: sp.sqrt(sum(entry**2 for entry in n) + _TINY)}
             ),
@@ -291,34 +377,47 @@ def _points() -> Kernel:
     )
 
 
-def second_order_parts() -> tuple[list[sp.Symbol], dict[sp.Symbol, sp.Expr], list[sp.Symbol]]:
+def second_order_parts() -> tuple[list[sp.Symbol], Names, list[sp.Symbol]]:
     """Return names of the corrected rotated match, their values, and the gradient's names."""
     x1, x2 = _symbols("p1_0", "p1_1"), _symbols("p2_0", "p2_1")
     n = _symbols("n0", "n1", "n2", "n3")
-    a1, a2, gradient = stationary_point()
-    values = reciprocals(MULTIPLIER.symbol())
-    values |= dict(zip((*x1, *x2, *n), (*a1, *a2, *gradient), strict=True))
+    *_, gradient = stationary_point()
+    l = MULTIPLIER.symbol()
+    values = half_reciprocals() | dict(zip(n, gradient, strict=True))
+    z_hat = (z - l * entry for z, entry in zip((*A1, *A2), n, strict=True))
+    values |= dict(zip((*x1, *x2), z_hat, strict=True))
     return [*x1, *x2], values, n
 
 
 def exact_hessian(
-    z: list[sp.Symbol], n: list[sp.Symbol], l: sp.Expr
-) -> tuple[sp.Matrix, sp.Matrix]:
-    """Return the exact Hessian of d^2/2 by vect(F) of the rotated images, and -phi'(l).
+    z: list[sp.Symbol], n: list[sp.Symbol], l: sp.Expr, weight: sp.Expr = sp.S.One
+) -> tuple[Names, sp.Matrix, sp.Symbol]:
+    """Return the exact Hessian of weight d^2/2 by vect(F) of the rotated images, and -phi'(l).
 
     The distance is the value of min |z - z_hat|^2 / 2 subject to C(z_hat, F) = 0 with multiplier
     l. Differentiating its optimality conditions by F gives H = l C_FF - R^T K^-1 R with
     K = [[M, n], [n^T, 0]], M = I + l C_zz, R = [l C_zF; C_F]. C is linear in F, so C_FF = 0, and
-    K^-1 is written out by blocks.
+    K^-1 is written out by blocks; the diagonal coordinates give M^-1 by the `half_reciprocals`.
+    The first value names what Hessian and slope are made of.
     """
     C_F = sp.Matrix(_point_derivative(z[:2], z[2:]))
     C_zF = jacobian(list(C_F), z).T
-    C_zz = sp.hessian(bilinear(z[:2], z[2:]), z)
-    M_inverse = (sp.eye(4) + l * C_zz).inv().applyfunc(sp.factor)
-    v = M_inverse * sp.Matrix(n)
-    slope = (sp.Matrix(n).T * v)[0]
-    w = C_F - l * C_zF.T * v
-    return w * w.T / slope - l**2 * C_zF.T * M_inverse * C_zF, slope
+    turn = jacobian(diagonal_coordinates(z), z)
+    M_inverse = turn.T * sp.diag(*(2 * r for r in RECIPROCALS)) * turn
+    slope, outer = _symbols("slope", "outer")
+    v = _symbols("v0", "v1", "v2", "v3")
+    names = dict(zip(v, M_inverse * sp.Matrix(n), strict=True))
+    names |= {slope: sum(a * b for a, b in zip(n, v, strict=True)), outer: weight / slope}
+    w = C_F - l * C_zF.T * sp.Matrix(v)
+    for k in range(8):  # the last entry of w is 1
+        name = sp.Symbol(f"w{k}", real=True)
+        names[name], w[k] = sp.collect(w[k], z[2:]), name
+    weighted = sp.zeros(4, 4)
+    for i, j in ((0, 0), (0, 2), (1, 1), (1, 3)):
+        name = sp.Symbol(f"inverse{i}{j}", real=True)
+        names[name] = weight * l**2 * M_inverse[i, j]
+        weighted[i, j] = weighted[j, i] = weighted[(i + 2) % 4, (j + 2) % 4] = name
+    return names, outer * w * w.T - C_zF.T * weighted * C_zF, slope
 
 
 def _normal_equations() -> list[Kernel]:
@@ -330,16 +429,18 @@ def _normal_equations() -> list[Kernel]:
     z, values, n = second_order_parts()
     l = MULTIPLIER.symbol()
     weight, curvature = Input("weight"), Input("curvature")
-    squared = sp.Symbol("length2", real=True)
+    first, ratio, second = _symbols("first", "ratio", "second")
+    values |= {first: weight.symbol() * l}
+    values |= {ratio: weight.symbol() / (sum(e**2 for e in n) + _TINY)}
     C_F = sp.Matrix(_point_derivative(z[:2], z[2:]))
     # d * dd/dF = l |n| * C_F / |n|
-    gradient = Output.of("g", weight.symbol() * l * C_F, summed=True)
-    gauss_newton = weight.symbol() * C_F * C_F.T / squared
-    normal = Output.of("N", upper(gauss_newton), summed=True)
-    hessian, _ = exact_hessian(z, n, l)
-    exact = weight.symbol() * hessian + curvature.symbol() * l**2 * C_F * C_F.T
-    stages = (rotate_match(), Let(values | {squared: sum(e**2 for e in n) + _TINY}))
+    gradient = Output.of("g", first * C_F, summed=True)
+    normal = Output.of("N", upper(ratio * C_F * C_F.T), summed=True)
+    names, hessian, _ = exact_hessian(z, n, l, weight.symbol())
+    names |= {second: curvature.symbol() * l**2}
+    exact = hessian + second * C_F * C_F.T
     arguments = (*FRAME, Q1, Q2, MULTIPLIER, weight)
+    foot = rotate_match().values | values
     return [
         Kernel(
             "reprojection_gauss_newton",
@@ -347,7 +448,8 @@ def _normal_equations() -> list[Kernel]:
             "of the rotated images.",
             arguments,
             (gradient, normal),
-            stages,
+            (Let(foot),),
+            staged=True,
         ),
         Kernel(
             "reprojection_newton",
@@ -355,6 +457,7 @@ def _normal_equations() -> list[Kernel]:
             "d^2 / 2 by vect(F) of the rotated images, H = l C_FF - R^T K^-1 R for each match.",
             (*arguments, curvature),
             (gradient, normal, Output.of("H", upper(exact), summed=True)),
-            stages,
+            (Let(foot | names),),
+            staged=True,
         ),
     ]

@@ -36,11 +36,11 @@ def squared_distance(P, Q, q, squared):
     squared[...] = t0*t0 + t1*t1
 
 
-def point_normal(P, Q, q, weight, V, D, g, squared):
+def point_normal(P, Q, q, weight, N, D, g, squared):
     # Formula: what an observation adds to its point's normal equations: w J_Q^T J_Q and w Z_Q^T
     # Z_Q (upper triangles; Z = d log depth), -w J_Q^T (q - q_hat), and |q - q_hat|^2.
     # Inputs:  P (3, 4), Q (4,), q (2,), weight ()
-    # Outputs: V (10,), D (10,), g (4,), squared ()
+    # Outputs: N (10,), D (10,), g (4,), squared ()
     # Operations: 138, temporaries: 29.
     P00 = P[0, 0]
     P01 = P[0, 1]
@@ -89,16 +89,16 @@ def point_normal(P, Q, q, weight, V, D, g, squared):
     t20 = P21*t18
     t21 = q0 - u
     t22 = q1 - v
-    V[0] = t1*t1*weight + t2*t2*weight
-    V[1] = t4*t5 + t6*t7
-    V[2] = t10*t7 + t5*t9
-    V[3] = t12*t5 + t13*t7
-    V[4] = t4*t4*weight + t6*t6*weight
-    V[5] = t10*t15 + t14*t9
-    V[6] = t12*t14 + t13*t15
-    V[7] = t10*t10*weight + t9*t9*weight
-    V[8] = t12*t16 + t13*t17
-    V[9] = t12*t12*weight + t13*t13*weight
+    N[0] = t1*t1*weight + t2*t2*weight
+    N[1] = t4*t5 + t6*t7
+    N[2] = t10*t7 + t5*t9
+    N[3] = t12*t5 + t13*t7
+    N[4] = t4*t4*weight + t6*t6*weight
+    N[5] = t10*t15 + t14*t9
+    N[6] = t12*t14 + t13*t15
+    N[7] = t10*t10*weight + t9*t9*weight
+    N[8] = t12*t16 + t13*t17
+    N[9] = t12*t12*weight + t13*t13*weight
     D[0] = P20*P20*t18
     D[1] = P21*t19
     D[2] = P22*t19
@@ -161,6 +161,60 @@ def camera_normal(P, Q, q, weight, A, depth, e):
     e[0] = -t2
     e[1] = -t3
     e[2] = t2*u + t3*v
+
+
+def sight_normal(P, q, weight, N):
+    # Formula: what a line of sight adds to its point's homogeneous equations: sum of w n n^T
+    # over the two unit normals n ~ q_k p3 - p_k (upper triangle).
+    # Inputs:  P (3, 4), q (2,), weight ()
+    # Outputs: N (10,)
+    # Operations: 78, temporaries: 22.
+    P00 = P[0, 0]
+    P01 = P[0, 1]
+    P02 = P[0, 2]
+    P03 = P[0, 3]
+    P10 = P[1, 0]
+    P11 = P[1, 1]
+    P12 = P[1, 2]
+    P13 = P[1, 3]
+    P20 = P[2, 0]
+    P21 = P[2, 1]
+    P22 = P[2, 2]
+    P23 = P[2, 3]
+    q0 = q[0]
+    q1 = q[1]
+    t0 = P20*q0 - P00
+    t1 = t0*t0
+    t9 = P20*q1 - P10
+    t10 = t9*t9
+    t11 = P21*q1 - P11
+    t12 = t11*t11
+    t13 = P22*q1 - P12
+    t14 = t13*t13
+    t15 = P23*q1 - P13
+    t16 = t15*t15
+    t17 = 1.0/(t10 + t12 + t14 + t16)
+    t2 = P21*q0 - P01
+    t3 = t2*t2
+    t4 = P22*q0 - P02
+    t5 = t4*t4
+    t6 = P23*q0 - P03
+    t7 = t6*t6
+    t8 = 1.0/(t1 + t3 + t5 + t7)
+    t18 = t0*t8
+    t19 = t17*t9
+    t20 = t2*t8
+    t21 = t11*t17
+    N[0] = weight*(t1*t8 + t10*t17)
+    N[1] = weight*(t11*t19 + t18*t2)
+    N[2] = weight*(t13*t19 + t18*t4)
+    N[3] = weight*(t15*t19 + t18*t6)
+    N[4] = weight*(t12*t17 + t3*t8)
+    N[5] = weight*(t13*t21 + t20*t4)
+    N[6] = weight*(t15*t21 + t20*t6)
+    N[7] = weight*(t14*t17 + t5*t8)
+    N[8] = weight*(t13*t15*t17 + t4*t6*t8)
+    N[9] = weight*(t16*t17 + t7*t8)
 
 
 def coupling(P, Q, weight, T, Y):
@@ -241,36 +295,135 @@ def coupling(P, Q, weight, T, Y):
     Y[2, 3] = -t18*v - t19*t9
 
 
-def inverse_root(V, T):
-    # Formula: upper triangular T with T T^T = V^-1, from the upper triangle of V.
-    # Inputs:  V (10,)
-    # Outputs: T (4, 4)
-    # Operations: 64, temporaries: 20.
-    V0 = V[0]
-    V1 = V[1]
-    V2 = V[2]
-    V3 = V[3]
-    V4 = V[4]
-    V5 = V[5]
-    V6 = V[6]
-    V7 = V[7]
-    V8 = V[8]
-    V9 = V[9]
-    L00 = np.sqrt(V0)
+def least_eigenvector(N, X):
+    # Formula: unit eigenvector of N (upper triangle) to its least eigenvalue, by squaring N^-1 8
+    # times.
+    # Inputs:  N (10,)
+    # Outputs: X (4,)
+    # Operations: 821, temporaries: 66.
+    N0 = N[0]
+    N1 = N[1]
+    N2 = N[2]
+    N3 = N[3]
+    N4 = N[4]
+    N5 = N[5]
+    N6 = N[6]
+    N7 = N[7]
+    N8 = N[8]
+    N9 = N[9]
+    trace = N0 + N4 + N7 + N9
+    t0 = 1.0/trace
+    L00 = np.sqrt(1e-13 + N0*t0)
     L_inverse00 = 1.0/L00
-    L10 = L_inverse00*V1
-    L11 = np.sqrt(V4 - L10*L10)
+    t1 = L_inverse00*t0
+    L10 = N1*t1
+    L11 = np.sqrt(1e-13 + N4*t0 - L10*L10)
     L_inverse11 = 1.0/L11
     L_inverse10 = -L10*L_inverse00*L_inverse11
-    L20 = L_inverse00*V2
-    L21 = L_inverse11*(V5 - L10*L20)
-    L22 = np.sqrt(V7 - L20*L20 - L21*L21)
+    L20 = N2*t1
+    L21 = L_inverse11*(N5*t0 - L10*L20)
+    L22 = np.sqrt(1e-13 + N7*t0 - L20*L20 - L21*L21)
     L_inverse22 = 1.0/L22
     L_inverse20 = -L_inverse22*(L20*L_inverse00 + L21*L_inverse10)
-    L30 = L_inverse00*V3
-    L31 = L_inverse11*(V6 - L10*L30)
-    L32 = L_inverse22*(V8 - L20*L30 - L21*L31)
-    L33 = np.sqrt(V9 - L30*L30 - L31*L31 - L32*L32)
+    L30 = N3*t1
+    L31 = L_inverse11*(N6*t0 - L10*L30)
+    L32 = L_inverse22*(N8*t0 - L20*L30 - L21*L31)
+    L33 = np.sqrt(1e-13 + N9*t0 - L30*L30 - L31*L31 - L32*L32)
+    L_inverse33 = 1.0/L33
+    L_inverse30 = -L_inverse33*(L30*L_inverse00 + L31*L_inverse10 + L32*L_inverse20)
+    L_inverse21 = -L21*L_inverse11*L_inverse22
+    L_inverse31 = -L_inverse33*(L31*L_inverse11 + L32*L_inverse21)
+    L_inverse32 = -L32*L_inverse22*L_inverse33
+    power0 = L_inverse00*L_inverse00 + L_inverse10*L_inverse10 + L_inverse20*L_inverse20 + L_inverse30*L_inverse30
+    power1 = L_inverse10*L_inverse11 + L_inverse20*L_inverse21 + L_inverse30*L_inverse31
+    power2 = L_inverse20*L_inverse22 + L_inverse30*L_inverse32
+    power3 = L_inverse30*L_inverse33
+    power4 = L_inverse11*L_inverse11 + L_inverse21*L_inverse21 + L_inverse31*L_inverse31
+    power5 = L_inverse21*L_inverse22 + L_inverse31*L_inverse32
+    power6 = L_inverse31*L_inverse33
+    power7 = L_inverse22*L_inverse22 + L_inverse32*L_inverse32
+    power8 = L_inverse32*L_inverse33
+    power9 = L_inverse33*L_inverse33
+    for _ in range(8):
+        size = power0 + power4 + power7 + power9
+        t2 = 1.0/(size*size)
+        t3 = power1*power1*t2
+        t4 = power2*power2*t2
+        t5 = power3*power3*t2
+        t6 = power1*t2
+        t7 = power2*t2
+        t8 = power3*t2
+        t10 = power6*power6*t2
+        t9 = power5*power5*t2
+        t11 = power5*t2
+        t12 = power6*t2
+        t13 = power8*power8*t2
+        t14 = power8*t2
+        t15 = t3 + t4 + t5 + power0*power0*t2
+        t16 = power0*t6 + power4*t6 + power5*t7 + power6*t8
+        t17 = power0*t7 + power5*t6 + power7*t7 + power8*t8
+        t18 = power0*t8 + power6*t6 + power8*t7 + power9*t8
+        t19 = t10 + t3 + t9 + power4*power4*t2
+        t20 = power2*t6 + power4*t11 + power7*t11 + power8*t12
+        t21 = power3*t6 + power4*t12 + power8*t11 + power9*t12
+        t22 = t13 + t4 + t9 + power7*power7*t2
+        t23 = power3*t7 + power6*t11 + power7*t14 + power9*t14
+        t24 = t10 + t13 + t5 + power9*power9*t2
+        power0 = t15
+        power1 = t16
+        power2 = t17
+        power3 = t18
+        power4 = t19
+        power5 = t20
+        power6 = t21
+        power7 = t22
+        power8 = t23
+        power9 = t24
+    t25 = power4 - power0
+    t26 = np.where(t25 > 0.0, power4, power0)
+    t27 = power7 - t26
+    t28 = power9 - np.where(t27 > 0.0, power7, t26)
+    x0 = np.where(t28 > 0.0, power3, np.where(t27 > 0.0, power2, np.where(t25 > 0.0, power1, power0)))
+    x1 = np.where(t28 > 0.0, power6, np.where(t27 > 0.0, power5, np.where(t25 > 0.0, power4, power1)))
+    x2 = np.where(t28 > 0.0, power8, np.where(t27 > 0.0, power7, np.where(t25 > 0.0, power5, power2)))
+    x3 = np.where(t28 > 0.0, power9, np.where(t27 > 0.0, power8, np.where(t25 > 0.0, power6, power3)))
+    t29 = 1.0/np.sqrt(x0*x0 + x1*x1 + x2*x2 + x3*x3)
+    X[0] = t29*x0
+    X[1] = t29*x1
+    X[2] = t29*x2
+    X[3] = t29*x3
+
+
+def inverse_root(N, T):
+    # Formula: upper triangular T with T T^T = N^-1, from the upper triangle of N.
+    # Inputs:  N (10,)
+    # Outputs: T (4, 4)
+    # Operations: 64, temporaries: 20.
+    N0 = N[0]
+    N1 = N[1]
+    N2 = N[2]
+    N3 = N[3]
+    N4 = N[4]
+    N5 = N[5]
+    N6 = N[6]
+    N7 = N[7]
+    N8 = N[8]
+    N9 = N[9]
+    L00 = np.sqrt(N0)
+    L_inverse00 = 1.0/L00
+    L10 = L_inverse00*N1
+    L11 = np.sqrt(N4 - L10*L10)
+    L_inverse11 = 1.0/L11
+    L_inverse10 = -L10*L_inverse00*L_inverse11
+    L20 = L_inverse00*N2
+    L21 = L_inverse11*(N5 - L10*L20)
+    L22 = np.sqrt(N7 - L20*L20 - L21*L21)
+    L_inverse22 = 1.0/L22
+    L_inverse20 = -L_inverse22*(L20*L_inverse00 + L21*L_inverse10)
+    L30 = L_inverse00*N3
+    L31 = L_inverse11*(N6 - L10*L30)
+    L32 = L_inverse22*(N8 - L20*L30 - L21*L31)
+    L33 = np.sqrt(N9 - L30*L30 - L31*L31 - L32*L32)
     L_inverse33 = 1.0/L33
     L_inverse30 = -L_inverse33*(L30*L_inverse00 + L31*L_inverse10 + L32*L_inverse20)
     L_inverse21 = -L21*L_inverse11*L_inverse22
@@ -294,22 +447,22 @@ def inverse_root(V, T):
     T[3, 3] = L_inverse33
 
 
-def damped_inverse_root(V, W, lam, T):
-    # Formula: upper triangular T with T T^T = (V + lam W)^-1, found where W = 1; upper
+def damped_inverse_root(N, W, lam, T):
+    # Formula: upper triangular T with T T^T = (N + lam W)^-1, found where W = 1; upper
     # triangles.
-    # Inputs:  V (10,), W (10,), lam () shared
+    # Inputs:  N (10,), W (10,), lam () shared
     # Outputs: T (4, 4)
     # Operations: 274, temporaries: 66.
-    V0 = V[0]
-    V1 = V[1]
-    V2 = V[2]
-    V3 = V[3]
-    V4 = V[4]
-    V5 = V[5]
-    V6 = V[6]
-    V7 = V[7]
-    V8 = V[8]
-    V9 = V[9]
+    N0 = N[0]
+    N1 = N[1]
+    N2 = N[2]
+    N3 = N[3]
+    N4 = N[4]
+    N5 = N[5]
+    N6 = N[6]
+    N7 = N[7]
+    N8 = N[8]
+    N9 = N[9]
     W0 = W[0]
     W1 = W[1]
     W2 = W[2]
@@ -322,21 +475,21 @@ def damped_inverse_root(V, W, lam, T):
     W9 = W[9]
     L00 = np.sqrt(W0)
     L_inverse00 = 1.0/L00
-    N00 = L_inverse00*L_inverse00*V0
-    M00 = np.sqrt(N00 + lam)
+    white00 = L_inverse00*L_inverse00*N0
+    M00 = np.sqrt(lam + white00)
     M_inverse00 = 1.0/M00
     L10 = L_inverse00*W1
     L11 = np.sqrt(W4 - L10*L10)
     L_inverse11 = 1.0/L11
     L_inverse10 = -L10*L_inverse00*L_inverse11
-    t0 = L_inverse10*V0
-    t1 = L_inverse11*V1
-    N01 = L_inverse00*t0 + L_inverse00*t1
-    M10 = M_inverse00*N01
-    t10 = L_inverse10*V1 + L_inverse11*V4
+    t0 = L_inverse10*N0
+    t1 = L_inverse11*N1
+    white01 = L_inverse00*t0 + L_inverse00*t1
+    M10 = M_inverse00*white01
+    t10 = L_inverse10*N1 + L_inverse11*N4
     t9 = t0 + t1
-    N11 = L_inverse10*t9 + L_inverse11*t10
-    M11 = np.sqrt(N11 + lam - M10*M10)
+    white11 = L_inverse10*t9 + L_inverse11*t10
+    M11 = np.sqrt(lam + white11 - M10*M10)
     M_inverse11 = 1.0/M11
     M_inverse10 = -M10*M_inverse00*M_inverse11
     L20 = L_inverse00*W2
@@ -344,21 +497,21 @@ def damped_inverse_root(V, W, lam, T):
     L22 = np.sqrt(W7 - L20*L20 - L21*L21)
     L_inverse22 = 1.0/L22
     L_inverse20 = -L_inverse22*(L20*L_inverse00 + L21*L_inverse10)
-    t2 = L_inverse20*V0
+    t2 = L_inverse20*N0
     L_inverse21 = -L21*L_inverse11*L_inverse22
-    t3 = L_inverse21*V1
-    t4 = L_inverse22*V2
-    N02 = L_inverse00*t2 + L_inverse00*t3 + L_inverse00*t4
-    M20 = M_inverse00*N02
-    t11 = L_inverse10*V2 + L_inverse11*V5
-    N12 = L_inverse20*t9 + L_inverse21*t10 + L_inverse22*t11
-    M21 = M_inverse11*(N12 - M10*M20)
-    t12 = t2 + t3 + t4
-    t13 = L_inverse20*V1 + L_inverse21*V4 + L_inverse22*V5
-    t14 = L_inverse20*V2 + L_inverse21*V5 + L_inverse22*V7
-    N22 = L_inverse20*t12 + L_inverse21*t13 + L_inverse22*t14
+    t3 = L_inverse21*N1
+    t4 = L_inverse22*N2
+    white02 = L_inverse00*t2 + L_inverse00*t3 + L_inverse00*t4
+    M20 = M_inverse00*white02
+    t11 = L_inverse10*N2 + L_inverse11*N5
+    white12 = L_inverse20*t9 + L_inverse21*t10 + L_inverse22*t11
+    M21 = M_inverse11*(white12 - M10*M20)
     t15 = -lam
-    M22 = np.sqrt(N22 - M20*M20 - M21*M21 - t15)
+    t12 = t2 + t3 + t4
+    t13 = L_inverse20*N1 + L_inverse21*N4 + L_inverse22*N5
+    t14 = L_inverse20*N2 + L_inverse21*N5 + L_inverse22*N7
+    white22 = L_inverse20*t12 + L_inverse21*t13 + L_inverse22*t14
+    M22 = np.sqrt(white22 - M20*M20 - M21*M21 - t15)
     M_inverse22 = 1.0/M22
     M_inverse20 = -M_inverse22*(M20*M_inverse00 + M21*M_inverse10)
     M_inverse21 = -M21*M_inverse11*M_inverse22
@@ -368,20 +521,20 @@ def damped_inverse_root(V, W, lam, T):
     L33 = np.sqrt(W9 - L30*L30 - L31*L31 - L32*L32)
     L_inverse33 = 1.0/L33
     L_inverse30 = -L_inverse33*(L30*L_inverse00 + L31*L_inverse10 + L32*L_inverse20)
-    t5 = L_inverse30*V0
+    t5 = L_inverse30*N0
     L_inverse31 = -L_inverse33*(L31*L_inverse11 + L32*L_inverse21)
-    t6 = L_inverse31*V1
+    t6 = L_inverse31*N1
     L_inverse32 = -L32*L_inverse22*L_inverse33
-    t7 = L_inverse32*V2
-    t8 = L_inverse33*V3
-    N03 = L_inverse00*t5 + L_inverse00*t6 + L_inverse00*t7 + L_inverse00*t8
-    M30 = M_inverse00*N03
-    N13 = L_inverse30*t9 + L_inverse31*t10 + L_inverse32*t11 + L_inverse33*(L_inverse10*V3 + L_inverse11*V6)
-    M31 = M_inverse11*(N13 - M10*M30)
-    N23 = L_inverse30*t12 + L_inverse31*t13 + L_inverse32*t14 + L_inverse33*(L_inverse20*V3 + L_inverse21*V6 + L_inverse22*V8)
-    M32 = M_inverse22*(N23 - M20*M30 - M21*M31)
-    N33 = L_inverse30*(t5 + t6 + t7 + t8) + L_inverse31*(L_inverse30*V1 + L_inverse31*V4 + L_inverse32*V5 + L_inverse33*V6) + L_inverse32*(L_inverse30*V2 + L_inverse31*V5 + L_inverse32*V7 + L_inverse33*V8) + L_inverse33*(L_inverse30*V3 + L_inverse31*V6 + L_inverse32*V8 + L_inverse33*V9)
-    M33 = np.sqrt(N33 - M30*M30 - M31*M31 - M32*M32 - t15)
+    t7 = L_inverse32*N2
+    t8 = L_inverse33*N3
+    white03 = L_inverse00*t5 + L_inverse00*t6 + L_inverse00*t7 + L_inverse00*t8
+    M30 = M_inverse00*white03
+    white13 = L_inverse30*t9 + L_inverse31*t10 + L_inverse32*t11 + L_inverse33*(L_inverse10*N3 + L_inverse11*N6)
+    M31 = M_inverse11*(white13 - M10*M30)
+    white23 = L_inverse30*t12 + L_inverse31*t13 + L_inverse32*t14 + L_inverse33*(L_inverse20*N3 + L_inverse21*N6 + L_inverse22*N8)
+    M32 = M_inverse22*(white23 - M20*M30 - M21*M31)
+    white33 = L_inverse30*(t5 + t6 + t7 + t8) + L_inverse31*(L_inverse30*N1 + L_inverse31*N4 + L_inverse32*N5 + L_inverse33*N6) + L_inverse32*(L_inverse30*N2 + L_inverse31*N5 + L_inverse32*N7 + L_inverse33*N8) + L_inverse33*(L_inverse30*N3 + L_inverse31*N6 + L_inverse32*N8 + L_inverse33*N9)
+    M33 = np.sqrt(white33 - M30*M30 - M31*M31 - M32*M32 - t15)
     M_inverse33 = 1.0/M33
     M_inverse30 = -M_inverse33*(M30*M_inverse00 + M31*M_inverse10 + M32*M_inverse20)
     M_inverse31 = -M_inverse33*(M31*M_inverse11 + M32*M_inverse21)
@@ -404,22 +557,22 @@ def damped_inverse_root(V, W, lam, T):
     T[3, 3] = L_inverse33*M_inverse33
 
 
-def point_step(V, W, g, lam, step, promised):
-    # Formula: a point's own damped step -(V + lam (V + W))^-1 g and the decrease of the cost
-    # that it promises at most, g^T (V + lam (V + W))^-1 g; upper triangles.
-    # Inputs:  V (10,), W (10,), g (4,), lam ()
+def point_step(N, W, g, lam, step, promised):
+    # Formula: a point's own damped step -(N + lam (N + W))^-1 g and the decrease of the cost
+    # that it promises at most, g^T (N + lam (N + W))^-1 g; upper triangles.
+    # Inputs:  N (10,), W (10,), g (4,), lam ()
     # Outputs: step (4,), promised ()
     # Operations: 137, temporaries: 24.
-    V0 = V[0]
-    V1 = V[1]
-    V2 = V[2]
-    V3 = V[3]
-    V4 = V[4]
-    V5 = V[5]
-    V6 = V[6]
-    V7 = V[7]
-    V8 = V[8]
-    V9 = V[9]
+    N0 = N[0]
+    N1 = N[1]
+    N2 = N[2]
+    N3 = N[3]
+    N4 = N[4]
+    N5 = N[5]
+    N6 = N[6]
+    N7 = N[7]
+    N8 = N[8]
+    N9 = N[9]
     W0 = W[0]
     W1 = W[1]
     W2 = W[2]
@@ -434,21 +587,21 @@ def point_step(V, W, g, lam, step, promised):
     g1 = g[1]
     g2 = g[2]
     g3 = g[3]
-    L00 = np.sqrt(V0 + lam*(V0 + W0))
+    L00 = np.sqrt(N0 + lam*(N0 + W0))
     L_inverse00 = 1.0/L00
-    L10 = L_inverse00*(V1 + lam*(V1 + W1))
-    L11 = np.sqrt(V4 + lam*(V4 + W4) - L10*L10)
+    L10 = L_inverse00*(N1 + lam*(N1 + W1))
+    L11 = np.sqrt(N4 + lam*(N4 + W4) - L10*L10)
     L_inverse11 = 1.0/L11
     L_inverse10 = -L10*L_inverse00*L_inverse11
-    L20 = L_inverse00*(V2 + lam*(V2 + W2))
-    L21 = L_inverse11*(V5 + lam*(V5 + W5) - L10*L20)
-    L22 = np.sqrt(V7 + lam*(V7 + W7) - L20*L20 - L21*L21)
+    L20 = L_inverse00*(N2 + lam*(N2 + W2))
+    L21 = L_inverse11*(N5 + lam*(N5 + W5) - L10*L20)
+    L22 = np.sqrt(N7 + lam*(N7 + W7) - L20*L20 - L21*L21)
     L_inverse22 = 1.0/L22
     L_inverse20 = -L_inverse22*(L20*L_inverse00 + L21*L_inverse10)
-    L30 = L_inverse00*(V3 + lam*(V3 + W3))
-    L31 = L_inverse11*(V6 + lam*(V6 + W6) - L10*L30)
-    L32 = L_inverse22*(V8 + lam*(V8 + W8) - L20*L30 - L21*L31)
-    L33 = np.sqrt(V9 + lam*(V9 + W9) - L30*L30 - L31*L31 - L32*L32)
+    L30 = L_inverse00*(N3 + lam*(N3 + W3))
+    L31 = L_inverse11*(N6 + lam*(N6 + W6) - L10*L30)
+    L32 = L_inverse22*(N8 + lam*(N8 + W8) - L20*L30 - L21*L31)
+    L33 = np.sqrt(N9 + lam*(N9 + W9) - L30*L30 - L31*L31 - L32*L32)
     L_inverse33 = 1.0/L33
     L_inverse30 = -L_inverse33*(L30*L_inverse00 + L31*L_inverse10 + L32*L_inverse20)
     y0 = L_inverse00*g0

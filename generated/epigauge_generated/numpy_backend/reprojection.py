@@ -57,7 +57,7 @@ def foot_point(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
     # Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
     # f () shared, q1 (2,), q2 (2,)
     # Outputs: multiplier (), last_change (), d ()
-    # Operations: 188, temporaries: 53.
+    # Operations: 168, temporaries: 35.
     R1_00 = R1[0, 0]
     R1_01 = R1[0, 1]
     R1_10 = R1[1, 0]
@@ -84,57 +84,39 @@ def foot_point(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
     t1 = b1_1 + a2_1*s1
     C0 = f + a1_0*t0 + a1_1*t1 + a2_0*b2_0 + a2_1*b2_1
     t2 = b2_0 + a1_0*s0
-    t4 = t0 + t2
-    hh0 = 0.5*t4*t4
-    t5 = b1_0 + a2_0*s0 - t2
-    hh1 = 0.5*t5*t5
+    sum0 = t0*t0 + t2*t2
+    difference0 = t0*t2
     t3 = b2_1 + a1_1*s1
-    t6 = t1 + t3
-    hh2 = 0.5*t6*t6
-    t7 = b1_1 + a2_1*s1 - t3
-    hh3 = 0.5*t7*t7
-    start = C0/(1e-300 + hh0 + hh1 + hh2 + hh3)
+    sum1 = t1*t1 + t3*t3
+    difference1 = t1*t3
+    start = C0/(1e-300 + sum0 + sum1)
     l = start
     change = 0.0
     for _ in range(2):
-        t8 = l*s0
-        below0 = 1.0 - t8
-        above0 = 1.0 + t8
-        pair0 = above0*below0
-        t9 = l*s1
-        above1 = 1.0 + t9
-        below1 = 1.0 - t9
-        pair1 = above1*below1
-        inverse = 1.0/(pair0*pair1)
-        inverse0 = inverse*pair1
-        r0 = below0*inverse0
-        r1 = above0*inverse0
-        inverse1 = inverse*pair0
-        r2 = below1*inverse1
-        r3 = above1*inverse1
-        newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3)
-        t10 = l + newton
-        l = t10
+        u0 = l*s0
+        v0 = u0*u0
+        D0 = 1.0 - v0
+        u1 = l*s1
+        v1 = u1*u1
+        D1 = 1.0 - v1
+        t4 = D0*D0
+        t5 = D1*D1
+        t6 = difference1*u1
+        t7 = difference0*u0
+        newton = D0*D1*(C0*t4*t5 - l*(t4*(sum1 + t6*(v1 - 3.0)) + t5*(sum0 + t7*(v0 - 3.0))))/(1e-300 + D0*D0*D0*(sum1*(1.0 + 3.0*v1) + t6*(-6.0 - 2.0*v1)) + D1*D1*D1*(sum0*(1.0 + 3.0*v0) + t7*(-6.0 - 2.0*v0)))
+        t8 = l + newton
+        l = t8
         change = newton
-    last = np.where(0.9999999999999858 - s0*np.abs(l) > 0.0, change, l)
-    t11 = l*s0
-    below0 = 1.0 - t11
-    above0 = 1.0 + t11
-    pair0 = above0*below0
-    t12 = l*s1
-    above1 = 1.0 + t12
-    below1 = 1.0 - t12
-    pair1 = above1*below1
-    inverse = 1.0/(pair0*pair1)
-    inverse0 = inverse*pair1
-    r0 = below0*inverse0
-    r1 = above0*inverse0
-    inverse1 = inverse*pair0
-    r2 = below1*inverse1
-    r3 = above1*inverse1
+    last = np.where(0.5 - s0*np.abs(l) > 0.0, change, l)
+    u0 = l*s0
+    v0 = u0*u0
+    D0 = 1.0 - v0
+    u1 = l*s1
+    v1 = u1*u1
+    D1 = 1.0 - v1
     multiplier[...] = l
     last_change[...] = last
-    d[...] = l*np.sqrt(hh0*r0*r0 + hh1*r1*r1 + hh2*r2*r2 + hh3*r3*r3)
+    d[...] = l*np.sqrt(D0*D0*(sum1*(1.0 + v1) - 4.0*difference1*u1) + D1*D1*(sum0*(1.0 + v0) - 4.0*difference0*u0))/(D0*D1)
 
 
 def foot_point_more(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
@@ -324,7 +306,7 @@ def foot_point_derivative(R1, R2, s, b1, b2, f, q1, q2, l, q1_hat, q2_hat, dd_dF
     # Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
     # f () shared, q1 (2,), q2 (2,), l ()
     # Outputs: q1_hat (2,), q2_hat (2,), dd_dF (9,)
-    # Operations: 103, temporaries: 43.
+    # Operations: 92, temporaries: 41.
     R1_00 = R1[0, 0]
     R1_01 = R1[0, 1]
     R1_10 = R1[1, 0]
@@ -353,52 +335,50 @@ def foot_point_derivative(R1, R2, s, b1, b2, f, q1, q2, l, q1_hat, q2_hat, dd_dF
     pair0 = above0*below0
     above1 = 1.0 + t1
     pair1 = above1*below1
-    inverse = 1.0/(pair0*pair1)
+    inverse = 0.5/(pair0*pair1)
     inverse1 = inverse*pair0
     r2 = below1*inverse1
-    t3 = 0.5*np.sqrt(2.0)
-    t9 = b2_1 + a1_1*s1
-    t10 = r2*t3*(b1_1 + t9 + a2_1*s1)
+    t7 = b2_1 + a1_1*s1
+    t8 = r2*(b1_1 + t7 + a2_1*s1)
     r3 = above1*inverse1
-    t11 = r3*t3*(b1_1 + a2_1*s1 - t9)
-    t12 = t10 + t11
-    t7 = l*t3
-    t13 = a1_1 - t12*t7
+    t9 = r3*(b1_1 + a2_1*s1 - t7)
+    t10 = t8 + t9
+    t11 = a1_1 - l*t10
     a1_0 = R1_00*q1_0 + R1_10*q1_1
     a2_0 = R2_00*q2_0 + R2_10*q2_1
     inverse0 = inverse*pair1
     r0 = below0*inverse0
     t2 = b2_0 + a1_0*s0
-    t4 = r0*t3*(b1_0 + t2 + a2_0*s0)
+    t3 = r0*(b1_0 + t2 + a2_0*s0)
     r1 = above0*inverse0
-    t5 = r1*t3*(b1_0 + a2_0*s0 - t2)
-    t6 = t4 + t5
-    t8 = a1_0 - t6*t7
-    p1_0 = R1_00*t8 + R1_01*t13
-    p1_1 = R1_10*t8 + R1_11*t13
-    t14 = t4 - t5
-    t15 = a2_0 - t14*t7
-    t16 = t10 - t11
-    t17 = a2_1 - t16*t7
-    p2_0 = R2_00*t15 + R2_01*t17
-    p2_1 = R2_10*t15 + R2_11*t17
-    length = np.sqrt(1e-300 + 0.5*t12*t12 + 0.5*t14*t14 + 0.5*t16*t16 + 0.5*t6*t6)
-    t18 = 1.0/length
-    t19 = p2_0*t18
-    t20 = p2_1*t18
+    t4 = r1*(b1_0 + a2_0*s0 - t2)
+    t5 = t3 + t4
+    t6 = a1_0 - l*t5
+    p1_0 = R1_00*t6 + R1_01*t11
+    p1_1 = R1_10*t6 + R1_11*t11
+    t12 = t3 - t4
+    t13 = a2_0 - l*t12
+    t14 = t8 - t9
+    t15 = a2_1 - l*t14
+    p2_0 = R2_00*t13 + R2_01*t15
+    p2_1 = R2_10*t13 + R2_11*t15
+    length = np.sqrt(1e-300 + t10*t10 + t12*t12 + t14*t14 + t5*t5)
+    t16 = 1.0/length
+    t17 = p2_0*t16
+    t18 = p2_1*t16
     q1_hat[0] = p1_0
     q1_hat[1] = p1_1
     q2_hat[0] = p2_0
     q2_hat[1] = p2_1
-    dd_dF[0] = p1_0*t19
-    dd_dF[1] = p1_1*t19
-    dd_dF[2] = t19
-    dd_dF[3] = p1_0*t20
-    dd_dF[4] = p1_1*t20
-    dd_dF[5] = t20
-    dd_dF[6] = p1_0*t18
-    dd_dF[7] = p1_1*t18
-    dd_dF[8] = t18
+    dd_dF[0] = p1_0*t17
+    dd_dF[1] = p1_1*t17
+    dd_dF[2] = t17
+    dd_dF[3] = p1_0*t18
+    dd_dF[4] = p1_1*t18
+    dd_dF[5] = t18
+    dd_dF[6] = p1_0*t16
+    dd_dF[7] = p1_1*t16
+    dd_dF[8] = t16
 
 
 def foot_point_each(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
@@ -406,7 +386,7 @@ def foot_point_each(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
     # its last change, and the signed distance d = l |n|; each match with its own frame.
     # Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,)
     # Outputs: multiplier (), last_change (), d ()
-    # Operations: 188, temporaries: 53.
+    # Operations: 168, temporaries: 35.
     R1_00 = R1[0, 0]
     R1_01 = R1[0, 1]
     R1_10 = R1[1, 0]
@@ -433,57 +413,39 @@ def foot_point_each(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
     t1 = b1_1 + a2_1*s1
     C0 = f + a1_0*t0 + a1_1*t1 + a2_0*b2_0 + a2_1*b2_1
     t2 = b2_0 + a1_0*s0
-    t4 = t0 + t2
-    hh0 = 0.5*t4*t4
-    t5 = b1_0 + a2_0*s0 - t2
-    hh1 = 0.5*t5*t5
+    sum0 = t0*t0 + t2*t2
+    difference0 = t0*t2
     t3 = b2_1 + a1_1*s1
-    t6 = t1 + t3
-    hh2 = 0.5*t6*t6
-    t7 = b1_1 + a2_1*s1 - t3
-    hh3 = 0.5*t7*t7
-    start = C0/(1e-300 + hh0 + hh1 + hh2 + hh3)
+    sum1 = t1*t1 + t3*t3
+    difference1 = t1*t3
+    start = C0/(1e-300 + sum0 + sum1)
     l = start
     change = 0.0
     for _ in range(2):
-        t8 = l*s0
-        below0 = 1.0 - t8
-        above0 = 1.0 + t8
-        pair0 = above0*below0
-        t9 = l*s1
-        above1 = 1.0 + t9
-        below1 = 1.0 - t9
-        pair1 = above1*below1
-        inverse = 1.0/(pair0*pair1)
-        inverse0 = inverse*pair1
-        r0 = below0*inverse0
-        r1 = above0*inverse0
-        inverse1 = inverse*pair0
-        r2 = below1*inverse1
-        r3 = above1*inverse1
-        newton = (C0 - 0.5*l*(hh0*r0 + hh0*r0*r0 + hh1*r1 + hh1*r1*r1 + hh2*r2 + hh2*r2*r2 + hh3*r3 + hh3*r3*r3))/(1e-300 + hh0*r0*r0*r0 + hh1*r1*r1*r1 + hh2*r2*r2*r2 + hh3*r3*r3*r3)
-        t10 = l + newton
-        l = t10
+        u0 = l*s0
+        v0 = u0*u0
+        D0 = 1.0 - v0
+        u1 = l*s1
+        v1 = u1*u1
+        D1 = 1.0 - v1
+        t4 = D0*D0
+        t5 = D1*D1
+        t6 = difference1*u1
+        t7 = difference0*u0
+        newton = D0*D1*(C0*t4*t5 - l*(t4*(sum1 + t6*(v1 - 3.0)) + t5*(sum0 + t7*(v0 - 3.0))))/(1e-300 + D0*D0*D0*(sum1*(1.0 + 3.0*v1) + t6*(-6.0 - 2.0*v1)) + D1*D1*D1*(sum0*(1.0 + 3.0*v0) + t7*(-6.0 - 2.0*v0)))
+        t8 = l + newton
+        l = t8
         change = newton
-    last = np.where(0.9999999999999858 - s0*np.abs(l) > 0.0, change, l)
-    t11 = l*s0
-    below0 = 1.0 - t11
-    above0 = 1.0 + t11
-    pair0 = above0*below0
-    t12 = l*s1
-    above1 = 1.0 + t12
-    below1 = 1.0 - t12
-    pair1 = above1*below1
-    inverse = 1.0/(pair0*pair1)
-    inverse0 = inverse*pair1
-    r0 = below0*inverse0
-    r1 = above0*inverse0
-    inverse1 = inverse*pair0
-    r2 = below1*inverse1
-    r3 = above1*inverse1
+    last = np.where(0.5 - s0*np.abs(l) > 0.0, change, l)
+    u0 = l*s0
+    v0 = u0*u0
+    D0 = 1.0 - v0
+    u1 = l*s1
+    v1 = u1*u1
+    D1 = 1.0 - v1
     multiplier[...] = l
     last_change[...] = last
-    d[...] = l*np.sqrt(hh0*r0*r0 + hh1*r1*r1 + hh2*r2*r2 + hh3*r3*r3)
+    d[...] = l*np.sqrt(D0*D0*(sum1*(1.0 + v1) - 4.0*difference1*u1) + D1*D1*(sum0*(1.0 + v0) - 4.0*difference0*u0))/(D0*D1)
 
 
 def foot_point_more_each(R1, R2, s, b1, b2, f, q1, q2, multiplier, last_change, d):
@@ -671,7 +633,7 @@ def foot_point_derivative_each(R1, R2, s, b1, b2, f, q1, q2, l, q1_hat, q2_hat, 
     # distance (envelope theorem); each match with its own frame.
     # Inputs:  R1 (2, 2), R2 (2, 2), s (2,), b1 (2,), b2 (2,), f (), q1 (2,), q2 (2,), l ()
     # Outputs: q1_hat (2,), q2_hat (2,), dd_dF (9,)
-    # Operations: 103, temporaries: 43.
+    # Operations: 92, temporaries: 41.
     R1_00 = R1[0, 0]
     R1_01 = R1[0, 1]
     R1_10 = R1[1, 0]
@@ -700,52 +662,50 @@ def foot_point_derivative_each(R1, R2, s, b1, b2, f, q1, q2, l, q1_hat, q2_hat, 
     pair0 = above0*below0
     above1 = 1.0 + t1
     pair1 = above1*below1
-    inverse = 1.0/(pair0*pair1)
+    inverse = 0.5/(pair0*pair1)
     inverse1 = inverse*pair0
     r2 = below1*inverse1
-    t3 = 0.5*np.sqrt(2.0)
-    t9 = b2_1 + a1_1*s1
-    t10 = r2*t3*(b1_1 + t9 + a2_1*s1)
+    t7 = b2_1 + a1_1*s1
+    t8 = r2*(b1_1 + t7 + a2_1*s1)
     r3 = above1*inverse1
-    t11 = r3*t3*(b1_1 + a2_1*s1 - t9)
-    t12 = t10 + t11
-    t7 = l*t3
-    t13 = a1_1 - t12*t7
+    t9 = r3*(b1_1 + a2_1*s1 - t7)
+    t10 = t8 + t9
+    t11 = a1_1 - l*t10
     a1_0 = R1_00*q1_0 + R1_10*q1_1
     a2_0 = R2_00*q2_0 + R2_10*q2_1
     inverse0 = inverse*pair1
     r0 = below0*inverse0
     t2 = b2_0 + a1_0*s0
-    t4 = r0*t3*(b1_0 + t2 + a2_0*s0)
+    t3 = r0*(b1_0 + t2 + a2_0*s0)
     r1 = above0*inverse0
-    t5 = r1*t3*(b1_0 + a2_0*s0 - t2)
-    t6 = t4 + t5
-    t8 = a1_0 - t6*t7
-    p1_0 = R1_00*t8 + R1_01*t13
-    p1_1 = R1_10*t8 + R1_11*t13
-    t14 = t4 - t5
-    t15 = a2_0 - t14*t7
-    t16 = t10 - t11
-    t17 = a2_1 - t16*t7
-    p2_0 = R2_00*t15 + R2_01*t17
-    p2_1 = R2_10*t15 + R2_11*t17
-    length = np.sqrt(1e-300 + 0.5*t12*t12 + 0.5*t14*t14 + 0.5*t16*t16 + 0.5*t6*t6)
-    t18 = 1.0/length
-    t19 = p2_0*t18
-    t20 = p2_1*t18
+    t4 = r1*(b1_0 + a2_0*s0 - t2)
+    t5 = t3 + t4
+    t6 = a1_0 - l*t5
+    p1_0 = R1_00*t6 + R1_01*t11
+    p1_1 = R1_10*t6 + R1_11*t11
+    t12 = t3 - t4
+    t13 = a2_0 - l*t12
+    t14 = t8 - t9
+    t15 = a2_1 - l*t14
+    p2_0 = R2_00*t13 + R2_01*t15
+    p2_1 = R2_10*t13 + R2_11*t15
+    length = np.sqrt(1e-300 + t10*t10 + t12*t12 + t14*t14 + t5*t5)
+    t16 = 1.0/length
+    t17 = p2_0*t16
+    t18 = p2_1*t16
     q1_hat[0] = p1_0
     q1_hat[1] = p1_1
     q2_hat[0] = p2_0
     q2_hat[1] = p2_1
-    dd_dF[0] = p1_0*t19
-    dd_dF[1] = p1_1*t19
-    dd_dF[2] = t19
-    dd_dF[3] = p1_0*t20
-    dd_dF[4] = p1_1*t20
-    dd_dF[5] = t20
-    dd_dF[6] = p1_0*t18
-    dd_dF[7] = p1_1*t18
-    dd_dF[8] = t18
+    dd_dF[0] = p1_0*t17
+    dd_dF[1] = p1_1*t17
+    dd_dF[2] = t17
+    dd_dF[3] = p1_0*t18
+    dd_dF[4] = p1_1*t18
+    dd_dF[5] = t18
+    dd_dF[6] = p1_0*t16
+    dd_dF[7] = p1_1*t16
+    dd_dF[8] = t16
 
 
 def reprojection_gauss_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, g, N):
@@ -754,7 +714,7 @@ def reprojection_gauss_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, g, N):
     # Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
     # f () shared, q1 (2,), q2 (2,), l (), weight ()
     # Outputs: g (9,) summed, N (45,) summed
-    # Operations: 128, temporaries: 63.
+    # Operations: 118, temporaries: 57.
     R1_00 = R1[0, 0]
     R1_01 = R1[0, 1]
     R1_10 = R1[1, 0]
@@ -774,122 +734,116 @@ def reprojection_gauss_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, g, N):
     q2_0 = q2[0]
     q2_1 = q2[1]
     a1_0 = R1_00*q1_0 + R1_10*q1_1
-    t3 = 0.5*np.sqrt(2.0)
+    a1_1 = R1_01*q1_0 + R1_11*q1_1
     a2_0 = R2_00*q2_0 + R2_10*q2_1
+    a2_1 = R2_01*q2_0 + R2_11*q2_1
     t0 = l*s0
-    below0 = 1.0 - t0
     above0 = 1.0 + t0
+    below0 = 1.0 - t0
     pair0 = above0*below0
     t1 = l*s1
     above1 = 1.0 + t1
     below1 = 1.0 - t1
     pair1 = above1*below1
-    inverse = 1.0/(pair0*pair1)
+    inverse = 0.5/(pair0*pair1)
     inverse0 = inverse*pair1
     r0 = below0*inverse0
-    t2 = b2_0 + a1_0*s0
-    t4 = r0*t3*(b1_0 + t2 + a2_0*s0)
     r1 = above0*inverse0
-    t5 = r1*t3*(b1_0 + a2_0*s0 - t2)
-    t6 = t3*(t4 + t5)
-    p1_0 = a1_0 - l*t6
-    t11 = t3*(t4 - t5)
-    p2_0 = a2_0 - l*t11
-    t13 = l*weight
-    t14 = p2_0*t13
-    a1_1 = R1_01*q1_0 + R1_11*q1_1
-    a2_1 = R2_01*q2_0 + R2_11*q2_1
     inverse1 = inverse*pair0
     r2 = below1*inverse1
-    t7 = b2_1 + a1_1*s1
-    t8 = r2*t3*(b1_1 + t7 + a2_1*s1)
     r3 = above1*inverse1
-    t9 = r3*t3*(b1_1 + a2_1*s1 - t7)
-    t10 = t3*(t8 + t9)
-    p1_1 = a1_1 - l*t10
-    t12 = t3*(t8 - t9)
-    p2_1 = a2_1 - l*t12
-    t15 = p2_1*t13
-    t16 = p1_0*p1_0
-    n0 = t6
-    n1 = t10
-    n2 = t11
-    n3 = t12
-    length2 = 1e-300 + n0*n0 + n1*n1 + n2*n2 + n3*n3
-    t17 = weight/length2
-    t18 = p2_0*p2_0*t17
-    t19 = p1_0*t18
-    t20 = p2_0*t17
-    t21 = t16*t20
-    t22 = p1_0*t20
-    t23 = p2_1*t22
-    t24 = p1_1*t23
-    t25 = p1_1*t22
-    t26 = p1_1*p1_1
-    t27 = t20*t26
-    t28 = p1_1*t20
-    t29 = p2_1*t28
-    t30 = p2_1*p2_1*t17
-    t31 = p1_0*t30
-    t32 = p2_1*t17
-    t33 = p1_0*t32
-    t34 = p1_1*t33
-    t35 = p1_1*t32
-    t36 = p1_0*t17
-    g[0] = np.add.reduce(p1_0*t14, axis=-1)
-    g[1] = np.add.reduce(p1_1*t14, axis=-1)
-    g[2] = np.add.reduce(t14, axis=-1)
-    g[3] = np.add.reduce(p1_0*t15, axis=-1)
-    g[4] = np.add.reduce(p1_1*t15, axis=-1)
-    g[5] = np.add.reduce(t15, axis=-1)
-    g[6] = np.add.reduce(p1_0*t13, axis=-1)
-    g[7] = np.add.reduce(p1_1*t13, axis=-1)
-    g[8] = np.add.reduce(t13, axis=-1)
-    N[0] = np.add.reduce(t16*t18, axis=-1)
-    N[1] = np.add.reduce(p1_1*t19, axis=-1)
-    N[2] = np.add.reduce(t19, axis=-1)
-    N[3] = np.add.reduce(p2_1*t21, axis=-1)
-    N[4] = np.add.reduce(t24, axis=-1)
-    N[5] = np.add.reduce(t23, axis=-1)
-    N[6] = np.add.reduce(t21, axis=-1)
-    N[7] = np.add.reduce(t25, axis=-1)
-    N[8] = np.add.reduce(t22, axis=-1)
-    N[9] = np.add.reduce(t18*t26, axis=-1)
-    N[10] = np.add.reduce(p1_1*t18, axis=-1)
-    N[11] = np.add.reduce(t24, axis=-1)
-    N[12] = np.add.reduce(p2_1*t27, axis=-1)
-    N[13] = np.add.reduce(t29, axis=-1)
-    N[14] = np.add.reduce(t25, axis=-1)
-    N[15] = np.add.reduce(t27, axis=-1)
-    N[16] = np.add.reduce(t28, axis=-1)
-    N[17] = np.add.reduce(t18, axis=-1)
-    N[18] = np.add.reduce(t23, axis=-1)
-    N[19] = np.add.reduce(t29, axis=-1)
-    N[20] = np.add.reduce(p2_1*t20, axis=-1)
-    N[21] = np.add.reduce(t22, axis=-1)
-    N[22] = np.add.reduce(t28, axis=-1)
-    N[23] = np.add.reduce(t20, axis=-1)
-    N[24] = np.add.reduce(t16*t30, axis=-1)
-    N[25] = np.add.reduce(p1_1*t31, axis=-1)
-    N[26] = np.add.reduce(t31, axis=-1)
-    N[27] = np.add.reduce(t16*t32, axis=-1)
-    N[28] = np.add.reduce(t34, axis=-1)
-    N[29] = np.add.reduce(t33, axis=-1)
-    N[30] = np.add.reduce(t26*t30, axis=-1)
-    N[31] = np.add.reduce(p1_1*t30, axis=-1)
-    N[32] = np.add.reduce(t34, axis=-1)
-    N[33] = np.add.reduce(t26*t32, axis=-1)
-    N[34] = np.add.reduce(t35, axis=-1)
-    N[35] = np.add.reduce(t30, axis=-1)
-    N[36] = np.add.reduce(t33, axis=-1)
-    N[37] = np.add.reduce(t35, axis=-1)
-    N[38] = np.add.reduce(t32, axis=-1)
-    N[39] = np.add.reduce(t16*t17, axis=-1)
-    N[40] = np.add.reduce(p1_1*t36, axis=-1)
-    N[41] = np.add.reduce(t36, axis=-1)
-    N[42] = np.add.reduce(t17*t26, axis=-1)
-    N[43] = np.add.reduce(p1_1*t17, axis=-1)
-    N[44] = np.add.reduce(t17, axis=-1)
+    t2 = b2_0 + a1_0*s0
+    t3 = r0*(b1_0 + t2 + a2_0*s0)
+    t4 = r1*(b1_0 + a2_0*s0 - t2)
+    n0 = t3 + t4
+    t5 = b2_1 + a1_1*s1
+    t6 = r2*(b1_1 + t5 + a2_1*s1)
+    t7 = r3*(b1_1 + a2_1*s1 - t5)
+    n1 = t6 + t7
+    n2 = t3 - t4
+    n3 = t6 - t7
+    p1_0 = a1_0 - l*n0
+    p1_1 = a1_1 - l*n1
+    p2_0 = a2_0 - l*n2
+    p2_1 = a2_1 - l*n3
+    first = l*weight
+    ratio = weight/(1e-300 + n0*n0 + n1*n1 + n2*n2 + n3*n3)
+    t8 = first*p2_0
+    t9 = first*p2_1
+    t10 = p1_0*p1_0
+    t11 = p2_0*p2_0*ratio
+    t12 = p1_0*t11
+    t13 = p2_0*ratio
+    t14 = t10*t13
+    t15 = p1_0*t13
+    t16 = p2_1*t15
+    t17 = p1_1*t16
+    t18 = p1_1*t15
+    t19 = p1_1*p1_1
+    t20 = t13*t19
+    t21 = p1_1*t13
+    t22 = p2_1*t21
+    t23 = p2_1*p2_1*ratio
+    t24 = p1_0*t23
+    t25 = p2_1*ratio
+    t26 = p1_0*t25
+    t27 = p1_1*t26
+    t28 = p1_1*t25
+    t29 = p1_0*ratio
+    g[0] = np.add.reduce(p1_0*t8, axis=-1)
+    g[1] = np.add.reduce(p1_1*t8, axis=-1)
+    g[2] = np.add.reduce(t8, axis=-1)
+    g[3] = np.add.reduce(p1_0*t9, axis=-1)
+    g[4] = np.add.reduce(p1_1*t9, axis=-1)
+    g[5] = np.add.reduce(t9, axis=-1)
+    g[6] = np.add.reduce(first*p1_0, axis=-1)
+    g[7] = np.add.reduce(first*p1_1, axis=-1)
+    g[8] = np.add.reduce(first, axis=-1)
+    N[0] = np.add.reduce(t10*t11, axis=-1)
+    N[1] = np.add.reduce(p1_1*t12, axis=-1)
+    N[2] = np.add.reduce(t12, axis=-1)
+    N[3] = np.add.reduce(p2_1*t14, axis=-1)
+    N[4] = np.add.reduce(t17, axis=-1)
+    N[5] = np.add.reduce(t16, axis=-1)
+    N[6] = np.add.reduce(t14, axis=-1)
+    N[7] = np.add.reduce(t18, axis=-1)
+    N[8] = np.add.reduce(t15, axis=-1)
+    N[9] = np.add.reduce(t11*t19, axis=-1)
+    N[10] = np.add.reduce(p1_1*t11, axis=-1)
+    N[11] = np.add.reduce(t17, axis=-1)
+    N[12] = np.add.reduce(p2_1*t20, axis=-1)
+    N[13] = np.add.reduce(t22, axis=-1)
+    N[14] = np.add.reduce(t18, axis=-1)
+    N[15] = np.add.reduce(t20, axis=-1)
+    N[16] = np.add.reduce(t21, axis=-1)
+    N[17] = np.add.reduce(t11, axis=-1)
+    N[18] = np.add.reduce(t16, axis=-1)
+    N[19] = np.add.reduce(t22, axis=-1)
+    N[20] = np.add.reduce(p2_1*t13, axis=-1)
+    N[21] = np.add.reduce(t15, axis=-1)
+    N[22] = np.add.reduce(t21, axis=-1)
+    N[23] = np.add.reduce(t13, axis=-1)
+    N[24] = np.add.reduce(t10*t23, axis=-1)
+    N[25] = np.add.reduce(p1_1*t24, axis=-1)
+    N[26] = np.add.reduce(t24, axis=-1)
+    N[27] = np.add.reduce(t10*t25, axis=-1)
+    N[28] = np.add.reduce(t27, axis=-1)
+    N[29] = np.add.reduce(t26, axis=-1)
+    N[30] = np.add.reduce(t19*t23, axis=-1)
+    N[31] = np.add.reduce(p1_1*t23, axis=-1)
+    N[32] = np.add.reduce(t27, axis=-1)
+    N[33] = np.add.reduce(t19*t25, axis=-1)
+    N[34] = np.add.reduce(t28, axis=-1)
+    N[35] = np.add.reduce(t23, axis=-1)
+    N[36] = np.add.reduce(t26, axis=-1)
+    N[37] = np.add.reduce(t28, axis=-1)
+    N[38] = np.add.reduce(t25, axis=-1)
+    N[39] = np.add.reduce(ratio*t10, axis=-1)
+    N[40] = np.add.reduce(p1_1*t29, axis=-1)
+    N[41] = np.add.reduce(t29, axis=-1)
+    N[42] = np.add.reduce(ratio*t19, axis=-1)
+    N[43] = np.add.reduce(p1_1*ratio, axis=-1)
+    N[44] = np.add.reduce(ratio, axis=-1)
 
 
 def reprojection_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, curvature, g, N, H):
@@ -898,7 +852,7 @@ def reprojection_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, curvature, g, N
     # Inputs:  R1 (2, 2) shared, R2 (2, 2) shared, s (2,) shared, b1 (2,) shared, b2 (2,) shared,
     # f () shared, q1 (2,), q2 (2,), l (), weight (), curvature ()
     # Outputs: g (9,) summed, N (45,) summed, H (45,) summed
-    # Operations: 442, temporaries: 143.
+    # Operations: 396, temporaries: 119.
     R1_00 = R1[0, 0]
     R1_01 = R1[0, 1]
     R1_10 = R1[1, 0]
@@ -917,245 +871,221 @@ def reprojection_newton(R1, R2, s, b1, b2, f, q1, q2, l, weight, curvature, g, N
     q1_1 = q1[1]
     q2_0 = q2[0]
     q2_1 = q2[1]
-    t17 = l*weight
     a1_0 = R1_00*q1_0 + R1_10*q1_1
-    t7 = 0.5*np.sqrt(2.0)
+    a1_1 = R1_01*q1_0 + R1_11*q1_1
     a2_0 = R2_00*q2_0 + R2_10*q2_1
+    a2_1 = R2_01*q2_0 + R2_11*q2_1
     t0 = l*s0
-    t2 = t0 - 1.0
-    below0 = -t2
-    t1 = 1.0 + t0
-    above0 = t1
+    above0 = 1.0 + t0
+    below0 = 1.0 - t0
     pair0 = above0*below0
-    t3 = l*s1
-    t4 = 1.0 + t3
-    above1 = t4
-    t5 = t3 - 1.0
-    below1 = -t5
+    t1 = l*s1
+    above1 = 1.0 + t1
+    below1 = 1.0 - t1
     pair1 = above1*below1
-    inverse = 1.0/(pair0*pair1)
+    inverse = 0.5/(pair0*pair1)
     inverse0 = inverse*pair1
     r0 = below0*inverse0
-    t6 = b2_0 + a1_0*s0
-    t8 = r0*t7*(b1_0 + t6 + a2_0*s0)
     r1 = above0*inverse0
-    t9 = r1*t7*(b1_0 + a2_0*s0 - t6)
-    t10 = t7*(t8 + t9)
-    p1_0 = a1_0 - l*t10
-    t15 = t7*(t8 - t9)
-    p2_0 = a2_0 - l*t15
-    t18 = p1_0*p2_0
-    a1_1 = R1_01*q1_0 + R1_11*q1_1
-    a2_1 = R2_01*q2_0 + R2_11*q2_1
     inverse1 = inverse*pair0
     r2 = below1*inverse1
-    t11 = b2_1 + a1_1*s1
-    t12 = r2*t7*(b1_1 + t11 + a2_1*s1)
     r3 = above1*inverse1
-    t13 = r3*t7*(b1_1 + a2_1*s1 - t11)
-    t14 = t7*(t12 + t13)
-    p1_1 = a1_1 - l*t14
-    t19 = p1_1*p2_0
-    t16 = t7*(t12 - t13)
-    p2_1 = a2_1 - l*t16
-    t20 = p1_0*p2_1
-    t21 = p1_1*p2_1
-    t22 = p1_0*p1_0
-    t23 = p2_0*p2_0
-    n0 = t10
-    n1 = t14
-    n2 = t15
-    n3 = t16
-    length2 = 1e-300 + n0*n0 + n1*n1 + n2*n2 + n3*n3
-    t24 = weight/length2
-    t25 = t23*t24
-    t26 = p1_0*t25
-    t27 = p2_0*t24
-    t28 = t22*t27
-    t29 = t18*t24
-    t30 = t21*t29
-    t31 = p2_1*t24
-    t32 = t18*t31
-    t33 = p1_1*t24
-    t34 = t18*t33
-    t35 = p1_1*p1_1
-    t36 = t27*t35
-    t37 = t19*t31
-    t38 = t19*t24
-    t39 = p2_1*p2_1
-    t40 = t24*t39
-    t41 = p1_0*t40
-    t42 = t20*t33
-    t43 = t20*t24
-    t44 = t21*t24
-    t45 = p1_0*t24
-    t46 = l*l
-    t47 = curvature*t46
-    t48 = t23*t47
-    t49 = 1.0/(t1*t2)
-    t50 = t46*t49
-    t51 = p1_0*t50
-    t52 = l*l*l
-    t53 = s0*t49*t52
-    t54 = p2_0*t53
-    t55 = t54 - t51
-    t56 = p2_0*t50
-    t57 = p1_0*t53
-    t58 = t57 - t56
-    t59 = n2*t49
-    t60 = n0*t49
-    t61 = t0*t60 - t59
-    t62 = l*t61
-    t63 = t0*t59 - t60
-    t64 = l*t63
-    t65 = p1_0*p2_0 - p1_0*t62 - p2_0*t64
-    t66 = 1.0/(t4*t5)
-    t67 = n1*t66
-    t68 = n3*t66
-    t69 = t3*t68 - t67
-    t70 = t3*t67 - t68
-    t71 = 1.0/(n0*t63 + n1*t69 + n2*t61 + n3*t70)
-    t72 = p1_0*t48
-    t73 = l*t69
-    t74 = p1_1*p2_0 - p1_1*t62 - p2_0*t73
-    t75 = p2_0 - t62
-    t76 = t65*t71
-    t77 = p2_0*t47
-    t78 = t22*t77
-    t79 = l*t70
-    t80 = p1_0*p2_1 - p1_0*t79 - p2_1*t64
-    t81 = t18*t47
-    t82 = t21*t81
-    t83 = p1_1*p2_1 - p1_1*t79 - p2_1*t73
-    t84 = t71*weight
-    t85 = t65*t84
-    t86 = p2_1*t47
-    t87 = t18*t86
-    t88 = p2_1 - t79
-    t89 = p1_0 - t64
-    t90 = p1_1*t47
-    t91 = t18*t90
-    t92 = p1_1 - t73
-    t93 = t46*t66
-    t94 = t71*t74
-    t95 = s1*t52*t66
-    t96 = t35*t77
-    t97 = p2_0*t93
-    t98 = t19*t86
-    t99 = t19*t47
-    t100 = t75*t84
-    t101 = t39*t47
-    t102 = p1_0*t101
-    t103 = p1_0*t93
-    t104 = t71*t80
-    t105 = t20*t90
-    t106 = t20*t47
-    t107 = p1_1*t93
-    t108 = p2_1*t95
-    t109 = p2_1*t93
-    t110 = p1_1*t95
-    t111 = t71*t83
-    t112 = t83*t84
-    t113 = t21*t47
-    t114 = t84*t88
-    t115 = p1_0*t47
-    t116 = t84*t89
-    g[0] = np.add.reduce(t17*t18, axis=-1)
-    g[1] = np.add.reduce(t17*t19, axis=-1)
-    g[2] = np.add.reduce(p2_0*t17, axis=-1)
-    g[3] = np.add.reduce(t17*t20, axis=-1)
-    g[4] = np.add.reduce(t17*t21, axis=-1)
-    g[5] = np.add.reduce(p2_1*t17, axis=-1)
-    g[6] = np.add.reduce(p1_0*t17, axis=-1)
-    g[7] = np.add.reduce(p1_1*t17, axis=-1)
-    g[8] = np.add.reduce(t17, axis=-1)
-    N[0] = np.add.reduce(t22*t25, axis=-1)
-    N[1] = np.add.reduce(p1_1*t26, axis=-1)
-    N[2] = np.add.reduce(t26, axis=-1)
-    N[3] = np.add.reduce(p2_1*t28, axis=-1)
-    N[4] = np.add.reduce(t30, axis=-1)
-    N[5] = np.add.reduce(t32, axis=-1)
-    N[6] = np.add.reduce(t28, axis=-1)
-    N[7] = np.add.reduce(t34, axis=-1)
-    N[8] = np.add.reduce(t29, axis=-1)
-    N[9] = np.add.reduce(t25*t35, axis=-1)
-    N[10] = np.add.reduce(p1_1*t25, axis=-1)
-    N[11] = np.add.reduce(t30, axis=-1)
-    N[12] = np.add.reduce(p2_1*t36, axis=-1)
-    N[13] = np.add.reduce(t37, axis=-1)
-    N[14] = np.add.reduce(t34, axis=-1)
-    N[15] = np.add.reduce(t36, axis=-1)
-    N[16] = np.add.reduce(t38, axis=-1)
-    N[17] = np.add.reduce(t25, axis=-1)
-    N[18] = np.add.reduce(t32, axis=-1)
-    N[19] = np.add.reduce(t37, axis=-1)
-    N[20] = np.add.reduce(p2_1*t27, axis=-1)
-    N[21] = np.add.reduce(t29, axis=-1)
-    N[22] = np.add.reduce(t38, axis=-1)
-    N[23] = np.add.reduce(t27, axis=-1)
-    N[24] = np.add.reduce(t22*t40, axis=-1)
-    N[25] = np.add.reduce(p1_1*t41, axis=-1)
-    N[26] = np.add.reduce(t41, axis=-1)
-    N[27] = np.add.reduce(t22*t31, axis=-1)
-    N[28] = np.add.reduce(t42, axis=-1)
-    N[29] = np.add.reduce(t43, axis=-1)
-    N[30] = np.add.reduce(t35*t40, axis=-1)
-    N[31] = np.add.reduce(p1_1*t40, axis=-1)
-    N[32] = np.add.reduce(t42, axis=-1)
-    N[33] = np.add.reduce(t31*t35, axis=-1)
-    N[34] = np.add.reduce(t44, axis=-1)
-    N[35] = np.add.reduce(t40, axis=-1)
-    N[36] = np.add.reduce(t43, axis=-1)
-    N[37] = np.add.reduce(t44, axis=-1)
-    N[38] = np.add.reduce(t31, axis=-1)
-    N[39] = np.add.reduce(t22*t24, axis=-1)
-    N[40] = np.add.reduce(p1_1*t45, axis=-1)
-    N[41] = np.add.reduce(t45, axis=-1)
-    N[42] = np.add.reduce(t24*t35, axis=-1)
-    N[43] = np.add.reduce(t33, axis=-1)
-    N[44] = np.add.reduce(t24, axis=-1)
-    H[0] = np.add.reduce(t22*t48 + weight*(t65*t65*t71 - p1_0*t55 - p2_0*t58), axis=-1)
-    H[1] = np.add.reduce(p1_1*t72 + weight*(t65*t71*t74 - p1_1*t55), axis=-1)
-    H[2] = np.add.reduce(t72 + weight*(t51 + t75*t76 - t54), axis=-1)
-    H[3] = np.add.reduce(p2_1*t78 + weight*(t65*t71*t80 - p2_1*t58), axis=-1)
-    H[4] = np.add.reduce(t82 + t83*t85, axis=-1)
-    H[5] = np.add.reduce(t87 + t85*t88, axis=-1)
-    H[6] = np.add.reduce(t78 + weight*(t56 + t76*t89 - t57), axis=-1)
-    H[7] = np.add.reduce(t91 + t85*t92, axis=-1)
-    H[8] = np.add.reduce(t81 + t85, axis=-1)
-    H[9] = np.add.reduce(t35*t48 + weight*(t23*t93 + t35*t50 + t71*t74*t74), axis=-1)
-    H[10] = np.add.reduce(p1_1*t48 + weight*(p1_1*t50 + t75*t94), axis=-1)
-    H[11] = np.add.reduce(t82 + weight*(t71*t74*t80 - t18*t95 - t21*t53), axis=-1)
-    H[12] = np.add.reduce(p2_1*t96 + weight*(p2_1*t97 + t83*t94 - t19*t95), axis=-1)
-    H[13] = np.add.reduce(t98 + weight*(t71*t74*t88 - p2_0*t95), axis=-1)
-    H[14] = np.add.reduce(t91 + weight*(t71*t74*t89 - p1_1*t53), axis=-1)
-    H[15] = np.add.reduce(t96 + weight*(t97 + t92*t94), axis=-1)
-    H[16] = np.add.reduce(t99 + t74*t84, axis=-1)
-    H[17] = np.add.reduce(t48 + weight*(t50 + t71*t75*t75), axis=-1)
-    H[18] = np.add.reduce(t87 + weight*(t71*t75*t80 - p2_1*t53), axis=-1)
-    H[19] = np.add.reduce(t98 + t100*t83, axis=-1)
-    H[20] = np.add.reduce(p2_1*t77 + t100*t88, axis=-1)
-    H[21] = np.add.reduce(t81 + weight*(t71*t75*t89 - t53), axis=-1)
-    H[22] = np.add.reduce(t99 + t100*t92, axis=-1)
-    H[23] = np.add.reduce(t100 + t77, axis=-1)
-    H[24] = np.add.reduce(t101*t22 + weight*(t22*t93 + t39*t50 + t71*t80*t80), axis=-1)
-    H[25] = np.add.reduce(p1_1*t102 + weight*(p1_1*t103 + t104*t83 - t20*t95), axis=-1)
-    H[26] = np.add.reduce(t102 + weight*(t103 + t104*t88), axis=-1)
-    H[27] = np.add.reduce(t22*t86 + weight*(p2_1*t50 + t104*t89), axis=-1)
-    H[28] = np.add.reduce(t105 + weight*(t71*t80*t92 - p1_0*t95), axis=-1)
-    H[29] = np.add.reduce(t106 + t80*t84, axis=-1)
-    H[30] = np.add.reduce(t101*t35 + weight*(t71*t83*t83 - p1_1*(t108 - t107) - p2_1*(t110 - t109)), axis=-1)
-    H[31] = np.add.reduce(p1_1*t101 + weight*(t107 + t111*t88 - t108), axis=-1)
-    H[32] = np.add.reduce(t105 + t112*t89, axis=-1)
-    H[33] = np.add.reduce(t35*t86 + weight*(t109 + t111*t92 - t110), axis=-1)
-    H[34] = np.add.reduce(t112 + t113, axis=-1)
-    H[35] = np.add.reduce(t101 + weight*(t93 + t71*t88*t88), axis=-1)
-    H[36] = np.add.reduce(t106 + t114*t89, axis=-1)
-    H[37] = np.add.reduce(t113 + weight*(t71*t88*t92 - t95), axis=-1)
-    H[38] = np.add.reduce(t114 + t86, axis=-1)
-    H[39] = np.add.reduce(t22*t47 + weight*(t50 + t71*t89*t89), axis=-1)
-    H[40] = np.add.reduce(p1_1*t115 + t116*t92, axis=-1)
-    H[41] = np.add.reduce(t115 + t116, axis=-1)
-    H[42] = np.add.reduce(t35*t47 + weight*(t93 + t71*t92*t92), axis=-1)
-    H[43] = np.add.reduce(t90 + t84*t92, axis=-1)
-    H[44] = np.add.reduce(t47 + t84, axis=-1)
+    t2 = b2_0 + a1_0*s0
+    t3 = r0*(b1_0 + t2 + a2_0*s0)
+    t4 = r1*(b1_0 + a2_0*s0 - t2)
+    n0 = t3 + t4
+    t5 = b2_1 + a1_1*s1
+    t6 = r2*(b1_1 + t5 + a2_1*s1)
+    t7 = r3*(b1_1 + a2_1*s1 - t5)
+    n1 = t6 + t7
+    n2 = t3 - t4
+    n3 = t6 - t7
+    p1_0 = a1_0 - l*n0
+    p1_1 = a1_1 - l*n1
+    p2_0 = a2_0 - l*n2
+    p2_1 = a2_1 - l*n3
+    first = l*weight
+    ratio = weight/(1e-300 + n0*n0 + n1*n1 + n2*n2 + n3*n3)
+    t8 = r0 + r1
+    t9 = r0 - r1
+    v0 = n0*t8 + n2*t9
+    t10 = r2 + r3
+    t11 = r2 - r3
+    v1 = n1*t10 + n3*t11
+    v2 = n0*t9 + n2*t8
+    v3 = n1*t11 + n3*t10
+    slope = n0*v0 + n1*v1 + n2*v2 + n3*v3
+    outer = weight/slope
+    t12 = l*v2
+    t13 = p1_0 - l*v0
+    w0 = p2_0*t13 - p1_0*t12
+    t14 = p1_1 - l*v1
+    w1 = p2_0*t14 - p1_1*t12
+    w2 = p2_0 - t12
+    t15 = l*v3
+    w3 = p2_1*t13 - p1_0*t15
+    w4 = p2_1*t14 - p1_1*t15
+    w5 = p2_1 - t15
+    w6 = t13
+    w7 = t14
+    t16 = l*l
+    t17 = t16*weight
+    inverse00 = t17*t8
+    inverse02 = t17*t9
+    inverse11 = t10*t17
+    inverse13 = t11*t17
+    second = curvature*t16
+    t18 = first*p2_0
+    t19 = first*p2_1
+    t20 = p1_0*p1_0
+    t21 = p2_0*p2_0
+    t22 = ratio*t21
+    t23 = p1_0*t22
+    t24 = p2_0*ratio
+    t25 = t20*t24
+    t26 = p1_0*t24
+    t27 = p2_1*t26
+    t28 = p1_1*t27
+    t29 = p1_1*t26
+    t30 = p1_1*p1_1
+    t31 = t24*t30
+    t32 = p1_1*t24
+    t33 = p2_1*t32
+    t34 = p2_1*p2_1
+    t35 = ratio*t34
+    t36 = p1_0*t35
+    t37 = p2_1*ratio
+    t38 = p1_0*t37
+    t39 = p1_1*t38
+    t40 = p1_1*t37
+    t41 = p1_0*ratio
+    t42 = second*t21
+    t43 = inverse00*p1_0 + inverse02*p2_0
+    t44 = inverse00*p2_0 + inverse02*p1_0
+    t45 = outer*w0
+    t46 = p2_0*second
+    t47 = p1_0*t46
+    t48 = p2_1*t47
+    t49 = p1_1*t47
+    t50 = outer*w1
+    t51 = inverse02*p1_1
+    t52 = inverse13*p2_0
+    t53 = inverse11*p2_0
+    t54 = p1_1*t46
+    t55 = p2_1*t54
+    t56 = -inverse00
+    t57 = outer*w2
+    t58 = inverse11*p1_0
+    t59 = inverse13*p1_0
+    t60 = outer*w3
+    t61 = second*t34
+    t62 = p2_1*second
+    t63 = p1_0*t62
+    t64 = p1_1*t63
+    t65 = inverse11*p1_1 + inverse13*p2_1
+    t66 = inverse11*p2_1 + inverse13*p1_1
+    t67 = outer*w4
+    t68 = p1_1*t62
+    t69 = -inverse11
+    t70 = outer*w5
+    t71 = outer*w6
+    t72 = p1_0*second
+    g[0] = np.add.reduce(p1_0*t18, axis=-1)
+    g[1] = np.add.reduce(p1_1*t18, axis=-1)
+    g[2] = np.add.reduce(t18, axis=-1)
+    g[3] = np.add.reduce(p1_0*t19, axis=-1)
+    g[4] = np.add.reduce(p1_1*t19, axis=-1)
+    g[5] = np.add.reduce(t19, axis=-1)
+    g[6] = np.add.reduce(first*p1_0, axis=-1)
+    g[7] = np.add.reduce(first*p1_1, axis=-1)
+    g[8] = np.add.reduce(first, axis=-1)
+    N[0] = np.add.reduce(t20*t22, axis=-1)
+    N[1] = np.add.reduce(p1_1*t23, axis=-1)
+    N[2] = np.add.reduce(t23, axis=-1)
+    N[3] = np.add.reduce(p2_1*t25, axis=-1)
+    N[4] = np.add.reduce(t28, axis=-1)
+    N[5] = np.add.reduce(t27, axis=-1)
+    N[6] = np.add.reduce(t25, axis=-1)
+    N[7] = np.add.reduce(t29, axis=-1)
+    N[8] = np.add.reduce(t26, axis=-1)
+    N[9] = np.add.reduce(t22*t30, axis=-1)
+    N[10] = np.add.reduce(p1_1*t22, axis=-1)
+    N[11] = np.add.reduce(t28, axis=-1)
+    N[12] = np.add.reduce(p2_1*t31, axis=-1)
+    N[13] = np.add.reduce(t33, axis=-1)
+    N[14] = np.add.reduce(t29, axis=-1)
+    N[15] = np.add.reduce(t31, axis=-1)
+    N[16] = np.add.reduce(t32, axis=-1)
+    N[17] = np.add.reduce(t22, axis=-1)
+    N[18] = np.add.reduce(t27, axis=-1)
+    N[19] = np.add.reduce(t33, axis=-1)
+    N[20] = np.add.reduce(p2_1*t24, axis=-1)
+    N[21] = np.add.reduce(t26, axis=-1)
+    N[22] = np.add.reduce(t32, axis=-1)
+    N[23] = np.add.reduce(t24, axis=-1)
+    N[24] = np.add.reduce(t20*t35, axis=-1)
+    N[25] = np.add.reduce(p1_1*t36, axis=-1)
+    N[26] = np.add.reduce(t36, axis=-1)
+    N[27] = np.add.reduce(t20*t37, axis=-1)
+    N[28] = np.add.reduce(t39, axis=-1)
+    N[29] = np.add.reduce(t38, axis=-1)
+    N[30] = np.add.reduce(t30*t35, axis=-1)
+    N[31] = np.add.reduce(p1_1*t35, axis=-1)
+    N[32] = np.add.reduce(t39, axis=-1)
+    N[33] = np.add.reduce(t30*t37, axis=-1)
+    N[34] = np.add.reduce(t40, axis=-1)
+    N[35] = np.add.reduce(t35, axis=-1)
+    N[36] = np.add.reduce(t38, axis=-1)
+    N[37] = np.add.reduce(t40, axis=-1)
+    N[38] = np.add.reduce(t37, axis=-1)
+    N[39] = np.add.reduce(ratio*t20, axis=-1)
+    N[40] = np.add.reduce(p1_1*t41, axis=-1)
+    N[41] = np.add.reduce(t41, axis=-1)
+    N[42] = np.add.reduce(ratio*t30, axis=-1)
+    N[43] = np.add.reduce(p1_1*ratio, axis=-1)
+    N[44] = np.add.reduce(ratio, axis=-1)
+    H[0] = np.add.reduce(outer*w0*w0 + t20*t42 - p1_0*t43 - p2_0*t44, axis=-1)
+    H[1] = np.add.reduce(t45*w1 + p1_0*p1_1*t42 - p1_1*t43, axis=-1)
+    H[2] = np.add.reduce(outer*w0*w2 + p1_0*second*t21 - t43, axis=-1)
+    H[3] = np.add.reduce(t45*w3 + p2_1*t20*t46 - p2_1*t44, axis=-1)
+    H[4] = np.add.reduce(p1_1*t48 + t45*w4, axis=-1)
+    H[5] = np.add.reduce(t48 + t45*w5, axis=-1)
+    H[6] = np.add.reduce(outer*w0*w6 + p2_0*second*t20 - t44, axis=-1)
+    H[7] = np.add.reduce(t49 + t45*w7, axis=-1)
+    H[8] = np.add.reduce(t45 + t47, axis=-1)
+    H[9] = np.add.reduce(outer*w1*w1 + second*t21*t30 - inverse00*t30 - inverse11*t21, axis=-1)
+    H[10] = np.add.reduce(p1_1*t42 + t50*w2 - inverse00*p1_1, axis=-1)
+    H[11] = np.add.reduce(outer*w1*w3 + p1_0*p1_1*p2_0*p2_1*second - p1_0*t52 - p2_1*t51, axis=-1)
+    H[12] = np.add.reduce(outer*w1*w4 + p2_0*p2_1*second*t30 - p1_1*t52 - p2_1*t53, axis=-1)
+    H[13] = np.add.reduce(t55 + t50*w5 - t52, axis=-1)
+    H[14] = np.add.reduce(t49 + t50*w6 - t51, axis=-1)
+    H[15] = np.add.reduce(t30*t46 + t50*w7 - t53, axis=-1)
+    H[16] = np.add.reduce(t50 + t54, axis=-1)
+    H[17] = np.add.reduce(t42 + t56 + outer*w2*w2, axis=-1)
+    H[18] = np.add.reduce(t48 + t57*w3 - inverse02*p2_1, axis=-1)
+    H[19] = np.add.reduce(t55 + t57*w4, axis=-1)
+    H[20] = np.add.reduce(p2_1*t46 + t57*w5, axis=-1)
+    H[21] = np.add.reduce(t47 + t57*w6 - inverse02, axis=-1)
+    H[22] = np.add.reduce(t54 + t57*w7, axis=-1)
+    H[23] = np.add.reduce(t46 + t57, axis=-1)
+    H[24] = np.add.reduce(outer*w3*w3 + second*t20*t34 - inverse00*t34 - inverse11*t20, axis=-1)
+    H[25] = np.add.reduce(outer*w3*w4 + p1_0*p1_1*second*t34 - p1_1*t58 - p2_1*t59, axis=-1)
+    H[26] = np.add.reduce(p1_0*t61 + t60*w5 - t58, axis=-1)
+    H[27] = np.add.reduce(t20*t62 + t60*w6 - inverse00*p2_1, axis=-1)
+    H[28] = np.add.reduce(t64 + t60*w7 - t59, axis=-1)
+    H[29] = np.add.reduce(t60 + t63, axis=-1)
+    H[30] = np.add.reduce(outer*w4*w4 + t30*t61 - p1_1*t65 - p2_1*t66, axis=-1)
+    H[31] = np.add.reduce(outer*w4*w5 + p1_1*second*t34 - t65, axis=-1)
+    H[32] = np.add.reduce(t64 + t67*w6, axis=-1)
+    H[33] = np.add.reduce(outer*w4*w7 + p2_1*second*t30 - t66, axis=-1)
+    H[34] = np.add.reduce(t67 + t68, axis=-1)
+    H[35] = np.add.reduce(t61 + t69 + outer*w5*w5, axis=-1)
+    H[36] = np.add.reduce(t63 + t70*w6, axis=-1)
+    H[37] = np.add.reduce(t68 + t70*w7 - inverse13, axis=-1)
+    H[38] = np.add.reduce(t62 + t70, axis=-1)
+    H[39] = np.add.reduce(t56 + outer*w6*w6 + second*t20, axis=-1)
+    H[40] = np.add.reduce(p1_1*t72 + t71*w7, axis=-1)
+    H[41] = np.add.reduce(t71 + t72, axis=-1)
+    H[42] = np.add.reduce(t69 + outer*w7*w7 + second*t30, axis=-1)
+    H[43] = np.add.reduce(outer*w7 + p1_1*second, axis=-1)
+    H[44] = np.add.reduce(outer + second, axis=-1)

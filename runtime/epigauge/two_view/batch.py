@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge import lm
-from epigauge._arguments import as_count, as_matches, as_weights
+from epigauge._arguments import as_array, as_count, as_matches, as_real, as_weights
 from epigauge.errors import ArgumentError
 from epigauge.two_view import native
 from epigauge.two_view._partial import Partial
@@ -130,7 +130,8 @@ def refine_fundamental_batch(
     bounds = _as_offsets(offsets, len(x1))
     count = len(bounds) - 1
     w = None if weights is None else np.ascontiguousarray(as_weights(weights, len(x1)))
-    starts = None if F0 is None else np.ascontiguousarray(F0, dtype=np.float64)
+    needed = f"a ({count}, 3, 3) array"
+    starts = None if F0 is None else np.ascontiguousarray(as_real("F0", F0, needed))
     if starts is not None and starts.shape != (count, 3, 3):
         raise ArgumentError("F0", f"has shape {starts.shape}", f"({count}, 3, 3)")
     _check_options(options)
@@ -140,18 +141,22 @@ def refine_fundamental_batch(
     done = 0
     with ThreadPoolExecutor(as_count("workers", workers)) as pool:
         futures = {pool.submit(work.refine, chunk): chunk for chunk in chunks}
-        for future in as_completed(futures):
-            future.result()
-            for _ in futures[future]:
-                done += 1
-                if progress is not None:
-                    progress(done, count)
+        try:
+            for future in as_completed(futures):
+                future.result()
+                for _ in futures[future]:
+                    done += 1
+                    if progress is not None:
+                        progress(done, count)
+        finally:  # the pool waits for what was submitted: after an error or Ctrl-C, drop the rest
+            for future in futures:
+                future.cancel()
     return work.result(flags)
 
 
 def _as_offsets(offsets: ArrayLike, m: int) -> NDArray[np.intp]:
     """Check that offsets partition m matches."""
-    bounds = np.asarray(offsets)
+    bounds = as_array("offsets", offsets, "an (n + 1,) array")
     if bounds.ndim != 1 or len(bounds) < 1 or bounds.dtype.kind not in "iu":
         raise ArgumentError("offsets", f"is {bounds.dtype} {bounds.shape}", "(n + 1,) integers")
     if bounds[0] != 0 or bounds[-1] != m or np.any(np.diff(bounds.astype(np.int64)) < 0):

@@ -35,7 +35,7 @@ def fundamental_from_cameras(cameras: Array) -> Array:
 class FreeState:
     """Cameras and points, residuals with their Jacobian blocks, root weights and cost."""
 
-    cameras: Array
+    motion: Array
     Q: Array
     r: Array
     J_P: Array
@@ -106,7 +106,7 @@ class FreeProblem:
             # Weighted like the rest of the system, so that damping sees no foreign scale.
             weight = float(np.mean(np.einsum("mkk->mk", V)))
             for k in (0, 1):
-                P = state.cameras[k].ravel()
+                P = state.motion[k].ravel()
                 U[12 * k : 12 * k + 12, 12 * k : 12 * k + 12] += weight * np.outer(P, P)
             V = V + weight * np.einsum("km,lm->mkl", state.Q, state.Q)
             border = np.sqrt(weight) * scatter_constraints(state.Q.T)
@@ -121,12 +121,20 @@ class FreeProblem:
 
     def retract(self, state: FreeState, step: Array) -> Estimate:
         """Return cameras and points that a step leads to."""
-        cameras = state.cameras + step[:24].reshape(2, 3, 4)
-        return self._settled(cameras, state.Q + step[24:].reshape(-1, 4).T)
+        return self.moved((state.motion, state.Q), step[:24], step[24:].reshape(-1, 4).T)
 
-    def fundamental(self, state: FreeState) -> Array:
-        """Return F of a state."""
-        return fundamental_from_cameras(state.cameras)
+    def cameras(self, motion: Array) -> tuple[Array, Array]:
+        """Return both cameras, one below the other, and the derivative of their entries."""
+        return motion.reshape(6, 4), np.eye(24)
+
+    def moved(self, estimate: Estimate, motion: Array, points: Array) -> Estimate:
+        """Return cameras and points moved by steps (24,) and (4, m), in the wanted basis."""
+        cameras, Q = estimate
+        return self._settled(cameras + motion.reshape(2, 3, 4), Q + points)
+
+    def fundamental(self, motion: Array) -> Array:
+        """Return F of two cameras."""
+        return fundamental_from_cameras(motion)
 
     def _settled(self, cameras: Array, Q: Array) -> Estimate:
         if not self.normalized:

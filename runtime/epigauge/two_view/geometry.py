@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
-from epigauge._arguments import as_fundamental, as_matches, as_real
+from epigauge._arguments import as_fundamental, as_matches, as_real, rescaled
 from epigauge.errors import ArgumentError
 from epigauge.two_view.conditioning import Conditioning, condition
 from epigauge.two_view.criteria import Reprojection
@@ -157,6 +157,9 @@ def triangulate(P: ArrayLike, x: ArrayLike) -> Array:
         raise ArgumentError("P", f"has shape {cameras.shape}", "two finite cameras, (2, 3, 4)")
     if not np.isfinite(cameras).all():
         raise ArgumentError("P", "is not finite", "two finite cameras, (2, 3, 4)")
+    if not cameras.any(axis=(1, 2)).all():
+        raise ArgumentError("P", "has a camera of zeros", "two finite cameras, (2, 3, 4)")
+    cameras = np.stack([rescaled(camera) for camera in cameras])
     points = as_real("x", x, "the two images' points, (2, m, 2)")
     if points.ndim != 3 or points.shape[0] != 2:
         raise ArgumentError("x", f"has shape {points.shape}", "the two images' points, (2, m, 2)")

@@ -121,7 +121,7 @@ class JointProblem:
     ) -> None:
         self.kernels = kernels
         self.parameterization = parameterization
-        self.q1, self.q2 = q1, q2
+        self.q = np.concatenate([q1, q2])
         self.weights, self.loss = weights, loss
         self.floor = 0.5 * float(np.sum(weights)) * 1e-30
 
@@ -129,15 +129,15 @@ class JointProblem:
         """Return motion and structure of a start value, each point at its foot point."""
         motion = self.parameterization.start(F)
         F, (P2, _) = self.parameterization.fundamental(motion), self.parameterization.camera(motion)
-        return motion, first_structure(self.kernels, F, P2, self.q1, self.q2)
+        return motion, first_structure(self.kernels, F, P2, self.q[:2], self.q[2:])
 
     def evaluate(self, estimate: tuple[Any, Array]) -> JointState:
         """Return the state of motion and structure."""
         motion, S = estimate
-        P2, derivative = self.parameterization.camera(motion)
+        P2, derivative = self.cameras(motion)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             # A point may step through the focal plane: the trial is then rejected by its cost.
-            r, J_S, J_P2 = self.kernels.two_view_structure(P2, S, self.q1, self.q2)
+            r, J_S, J_P2 = self.kernels.two_view_structure(P2, S, self.q[:2], self.q[2:])
             cost, root = reweighted(r, self.weights, self.loss)
         return JointState(motion, S, derivative, r, J_S, J_P2, root, cost)
 
@@ -158,9 +158,16 @@ class JointProblem:
     def retract(self, state: JointState, step: Array) -> tuple[Any, Array]:
         """Return motion and structure that a step leads to (step viii)."""
         p = self.parameterization.dimension
-        motion = self.parameterization.retract(state.motion, step[:p])
-        return motion, state.S + step[p:].reshape(-1, 3).T
+        return self.moved((state.motion, state.S), step[:p], step[p:].reshape(-1, 3).T)
 
-    def fundamental(self, state: JointState) -> Array:
-        """Return F of a state."""
-        return self.parameterization.fundamental(state.motion)
+    def cameras(self, motion: Any) -> tuple[Array, Array]:
+        """Return P' and its derivative by the motion parameters."""
+        return self.parameterization.camera(motion)
+
+    def moved(self, estimate: tuple[Any, Array], motion: Array, points: Array) -> tuple[Any, Array]:
+        """Return motion and structure moved by steps (p,) and (3, m)."""
+        return self.parameterization.retract(estimate[0], motion), estimate[1] + points
+
+    def fundamental(self, motion: Any) -> Array:
+        """Return F of a motion."""
+        return self.parameterization.fundamental(motion)

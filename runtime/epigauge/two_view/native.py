@@ -28,14 +28,24 @@ from epigauge.two_view.parameterizations import (
     Remapped,
 )
 
-__all__ = ["Minimum", "Pair", "PairOptions", "minimize", "pair_options", "refine_pairs", "supports"]
+__all__ = [
+    "LOSSES",
+    "Minimum",
+    "Pair",
+    "PairOptions",
+    "address",
+    "minimize",
+    "pair_options",
+    "refine_pairs",
+    "supports",
+]
 
 Array = NDArray[np.float64]
 
 #: Numbers of the choices in runtime/c/two_view.h.
 _CRITERIA = {"reprojection": 0, "sampson": 1, "epipolar": 2}
 _CHARTS = {Ortho: 0, Block: 1}
-_LOSSES = {"linear": 0, "huber": 1, "soft_l1": 2, "cauchy": 3, "truncated": 4}
+LOSSES = {"linear": 0, "huber": 1, "soft_l1": 2, "cauchy": 3, "truncated": 4}
 
 #: Widths of the tables that C fills: history, results and numbers of a pair.
 _ROW, _DOUBLES, _INTS = 6, 145, 5
@@ -139,10 +149,10 @@ def minimize(
     entries = None if entries is None else np.ascontiguousarray(entries)
     done = _functions()[0](
         q1.shape[1],
-        *map(_address, (q1, q2, weights)),
+        *map(address, (q1, q2, weights)),
         ctypes.addressof(options),
         p,
-        *map(_address, (basis, entries, motion, history)),
+        *map(address, (basis, entries, motion, history)),
         ctypes.addressof(outcome),
     )
     if not done:
@@ -179,7 +189,7 @@ def _options(
     return _Options(
         _CRITERIA[criterion],
         kind,
-        _LOSSES[loss],
+        LOSSES[loss],
         exact,
         damping == "seber",
         stopping.max_iter,
@@ -285,14 +295,15 @@ def refine_pairs(
     done = _functions()[1](
         0,
         n,
-        *map(_address, (offsets, x1, x2, weights, F0)),
+        *map(address, (offsets, x1, x2, weights, F0)),
         ctypes.addressof(options.structure),
-        *map(_address, (table, numbers, distances, rows if history else None)),
+        *map(address, (table, numbers, distances, rows if history else None)),
     )
     if not done:
         raise MemoryError(f"no room for {len(x1)} matches")
     return Pair(table, numbers, distances, rows)
 
 
-def _address(array: NDArray[Any] | None) -> int | None:
+def address(array: NDArray[Any] | None) -> int | None:
+    """Return where the entries of an array begin, or None (NULL) for none."""
     return None if array is None else int(array.__array_interface__["data"][0])

@@ -21,6 +21,7 @@ from epigauge.two_view.conditioning import Conditioning, condition, displaced
 from epigauge.two_view.criteria import CRITERIA, Criterion, Mahalanobis, Reprojection
 from epigauge.two_view.eliminated import EliminatedProblem
 from epigauge.two_view.free import FreeProblem
+from epigauge.two_view.fused import FusedProblem
 from epigauge.two_view.joint import JointProblem
 from epigauge.two_view.losses import EFFICIENT, Loss, robust_scale
 from epigauge.two_view.parameterizations import (
@@ -231,8 +232,8 @@ def _minimize_once(
         matches.frame.scale**2,
     )
     if options.parameterization in REDUNDANT:
-        assert isinstance(problem, FreeProblem | JointProblem)
-        F = problem.fundamental(outcome.state)
+        assert not isinstance(problem, EliminatedProblem)
+        F = problem.fundamental(outcome.state.motion)
         motion = chart.start(F)
     else:
         motion = outcome.state.motion
@@ -291,17 +292,23 @@ def _chart(matches: Matches, options: Options, start: Array) -> Parameterization
 
 def _problem(
     matches: Matches, options: Options, chart: Parameterization, loss: Loss
-) -> EliminatedProblem | JointProblem | FreeProblem:
-    table, q1, q2, weights = matches.table, matches.q1, matches.q2, matches.weights
+) -> EliminatedProblem | JointProblem | FreeProblem | FusedProblem:
+    if options.structure != "joint" and options.parameterization not in REDUNDANT:
+        criterion = matches.criterion(options.criterion)
+        exact = options.hessian == "exact"
+        return EliminatedProblem(criterion, chart, matches.weights, loss, exact)
+    reference = _joint_problem(matches, options, chart, loss)
+    return FusedProblem(reference) if matches.table.name == "c" else reference
+
+
+def _joint_problem(
+    matches: Matches, options: Options, chart: Parameterization, loss: Loss
+) -> JointProblem | FreeProblem:
+    table, fitted = matches.table, (matches.q1, matches.q2, matches.weights, loss)
     if options.parameterization in ("free", "normalized"):
-        normalized = options.parameterization == "normalized"
-        return FreeProblem(table, q1, q2, weights, loss, normalized)
-    if options.parameterization == "parfree":
-        return JointProblem(table, ParFree(table), q1, q2, weights, loss)
-    if options.structure == "joint":
-        return JointProblem(table, chart, q1, q2, weights, loss)
-    criterion = matches.criterion(options.criterion)
-    return EliminatedProblem(criterion, chart, weights, loss, options.hessian == "exact")
+        return FreeProblem(table, *fitted, options.parameterization == "normalized")
+    redundant = options.parameterization == "parfree"
+    return JointProblem(table, ParFree(table) if redundant else chart, *fitted)
 
 
 def _estimated_scale(matches: Matches, options: Options, F: Array) -> float:
