@@ -147,10 +147,11 @@ def dense(system: BundleSystem) -> Array:
     for j in range(m):
         rows = slice(n * a + j * b, n * a + (j + 1) * b)
         N[rows, rows] = system.V[j]
+    W = system.coupling.blocks()
     for k, (i, j) in enumerate(zip(layout.view, layout.point, strict=True)):
         rows, columns = slice(i * a, (i + 1) * a), slice(n * a + j * b, n * a + (j + 1) * b)
-        N[rows, columns] = system.W[k]
-        N[columns, rows] = system.W[k].T
+        N[rows, columns] = W[k]
+        N[columns, rows] = W[k].T
     if system.border is not None:
         r = system.border[0].shape[2]
         B = np.concatenate([part.reshape(-1, r) for part in system.border])

@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.kernels import backend
+from epigauge.multi_view._native import address, function
+
 __all__ = ["scatter_constraints", "spreading_basis"]
 
 Array = NDArray[np.float64]
@@ -26,6 +29,11 @@ def spreading_basis(Q: Array) -> Array:
     ndarray, shape (4, 4)
         The basis; where none exists (too many points in a plane or on a line) the last one reached.
     """
+    if backend() == "c":
+        T, points = np.empty((4, 4)), np.ascontiguousarray(Q)
+        if function("spreading_basis")(len(points), address(points), address(T)):
+            raise MemoryError(f"no memory for {len(points)} points")
+        return T
     T = np.eye(4)
     moved = Q / np.linalg.norm(Q, axis=1, keepdims=True)
     for _ in range(200):

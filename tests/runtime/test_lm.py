@@ -257,6 +257,19 @@ class TestEndings:
         assert out.status == -1
         assert out.history[-1].lam <= 1e16 * largest < 10 * out.history[-1].lam
 
+    @pytest.mark.parametrize("largest", [math.inf, math.nan, 4.0])
+    def test_system_that_no_lambda_makes_solvable_ends(self, largest) -> None:
+        class Unsolvable(Levenberg):
+            def step(self, system: Any, lam: float) -> np.ndarray:
+                raise np.linalg.LinAlgError
+
+        class Boundless(Dense):
+            def largest(self) -> float:
+                return largest
+
+        out = run(linear(system=Boundless), [7.0, -3.0], damping=Unsolvable())
+        assert (out.status, out.nit) == (-1, 0)
+
     @pytest.mark.parametrize("bad", [math.inf, math.nan])
     def test_cost_that_is_not_finite_rejects_a_trial(self, bad) -> None:
         problem = rosenbrock(cost=lambda evaluation, cost: bad if evaluation in (1, 4) else cost)
@@ -382,7 +395,7 @@ def test_tolerances_out_of_range_are_refused_by_name(name, value) -> None:
     assert repr(value) in str(caught.value)
 
 
-@pytest.mark.parametrize("value", [0, -1, 2.5, "many", None, math.nan])
+@pytest.mark.parametrize("value", [0, -1, 2.5, "many", None, math.nan, 10**9, 10**30])
 def test_max_iter_out_of_range_is_refused_by_name(value) -> None:
     with pytest.raises(ArgumentError) as caught:
         Stopping(max_iter=value)

@@ -11,7 +11,8 @@ import pytest
 from epigauge import kernels
 from epigauge.errors import ArgumentError
 from epigauge.multi_view import problem as problem_module
-from epigauge.multi_view.initialize import Frame, resect
+from epigauge.multi_view.initialize import Frame
+from epigauge.multi_view.resection import resect
 from epigauge.two_view.losses import Loss
 from laws import distance
 
@@ -135,7 +136,9 @@ def test_resection_finds_the_camera(wrong: int) -> None:
 def test_embedded_triangulation_never_raises_the_cost_of_a_point(
     loss: str, iterations: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(problem_module, "_POINT_ITERATIONS", iterations)
+    monkeypatch.setattr(
+        problem_module.BundleProblem, "triangulation", problem_module.Triangulation(iterations)
+    )
     rejected = 0
     for seed in range(5):
         truth = many_views.cameras_and_points(4, 50, flatness=0.05, seed=seed)
@@ -148,9 +151,9 @@ def test_embedded_triangulation_never_raises_the_cost_of_a_point(
         for _ in range(10):
             settled = near[0], problem.triangulated(*settled)
         for P, Q in (near, far, settled):
-            before, _ = problem._point_costs(problem.evaluate((P, Q)).r)
+            before = problem.point_costs(P, Q)
             moved = problem.triangulated(P, Q)
-            after, _ = problem._point_costs(problem.evaluate((P, moved)).r)
+            after = problem.point_costs(P, moved)
             assert (after <= before).all()
             if Q is settled[1]:
                 rejected += int((moved == Q).all(axis=1).sum())

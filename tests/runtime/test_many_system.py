@@ -8,6 +8,7 @@ import many_views
 import numpy as np
 import pytest
 from epigauge import kernels
+from epigauge.multi_view import coupling as coupling_module
 from epigauge.multi_view import null_space
 from epigauge.multi_view import system as system_module
 from epigauge.multi_view.problem import BundleState
@@ -115,7 +116,7 @@ def test_conjugate_gradients_give_the_same_solution(
     for each in (system, replace(system, border=border)):
         direct = each.solve()
         with monkeypatch.context() as patch:
-            patch.setattr(system_module, "DENSE_CAMERAS", 0)
+            patch.setattr(coupling_module, "DENSE_CAMERAS", 0)
             patch.setattr(
                 system_module.BundleSystem, "_reduced_matrix", lambda self: pytest.fail("dense")
             )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import kernels, lm
-from epigauge._arguments import as_choice, as_positive
+from epigauge._arguments import as_choice, as_count, as_positive
 from epigauge.errors import ArgumentError
 from epigauge.multi_view import dampings
 from epigauge.multi_view.gauge import GAUGES, Gauge, five_points, identity, normalized
@@ -94,6 +94,7 @@ def bundle_adjust(
     xtol: float = 0.0,
     gtol: float = 0.0,
     max_iter: int = 100,
+    workers: int = 1,
     backend: str | None = None,
     callback: Callable[[lm.Row], object] | None = None,
 ) -> BundleResult:
@@ -129,6 +130,9 @@ def bundle_adjust(
         As in `epigauge.lm.minimize`; `xtol` and `gtol` depend on the gauge and are off.
     max_iter : int
         Trial steps allowed.
+    workers : int
+        Threads that share the points, with the back end "c". The same number gives the same result
+        to the last bit; others differ by rounding.
     backend : {"c", "numpy", "casadi"}, optional
         Where the formulas are computed.
     callback : callable, optional
@@ -192,6 +196,7 @@ def bundle_adjust(
         np.asarray(tracks.weights),
         Loss(loss, scale_px / frame.scale),
         embedded and strategy.embedded and damping in (None, "covariant"),
+        as_count("workers", workers),
     )
     P, Q = frame.cameras_in(start.P), start.Q
     explicit = strategy.gauge if strategy.explicit else gauge

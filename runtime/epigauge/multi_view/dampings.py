@@ -81,7 +81,7 @@ class Covariant(ByMatrix):
 
     def step(self, system: Linearized, lam: float) -> Array:
         """Return -(N + lambda W)^-1 g, solved where W = I."""
-        return _whitened_step(system, self.matrix(system), lam)
+        return system.whitened_step(self.matrix(system), lam)
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class Implicit(ByMatrix):
 
     def step(self, system: Linearized, lam: float) -> Array:
         """Return -(N + lambda W)^-1 g, solved where W = I."""
-        return _whitened_step(system, self.matrix(system), lam)
+        return system.whitened_step(self.matrix(system), lam)
 
     def _moved(self, system: Linearized) -> tuple[Linearized, Blocks]:
         assert system.state is not None
@@ -194,19 +194,6 @@ def _identities(system: BundleSystem) -> Blocks:
     n, a = system.g_cameras.shape
     m, b = system.g_points.shape
     return np.broadcast_to(np.eye(a), (n, a, a)), np.broadcast_to(np.eye(b), (m, b, b))
-
-
-def _whitened_step(system: Linearized, W: Blocks, lam: float) -> Array:
-    """Return -(N + lambda W)^-1 g by parameters in which W = I.
-
-    There its condition is about |W^-1 N| / lambda whatever the basis; a basis far from the one
-    that suits the problem would cost digits, and the step its invariance.
-    """
-    roots = [np.swapaxes(np.linalg.cholesky(blocks), 1, 2) for blocks in W]
-    whitening = (np.linalg.inv(roots[0]), np.linalg.inv(roots[1]))
-    white = system.transformed(*whitening)
-    cameras, points = _identities(white)
-    return _mapped(whitening, *white.split(white.damped(lam * cameras, lam * points).solve()))
 
 
 def _mapped(blocks: Blocks, cameras: Array, points: Array) -> Array:

@@ -15,6 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from epigauge._arguments import as_real
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.tracks import Reconstruction
 from epigauge.scatter import spreading_basis
@@ -140,7 +141,7 @@ def transform(
     ArgumentError
         If T is singular or a scale is zero.
     """
-    matrix = np.asarray(T, dtype=np.float64)
+    matrix = as_real("T", T, "a finite (4, 4) matrix")
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise ArgumentError("T", f"has shape {matrix.shape}", "a finite (4, 4) matrix")
     if np.linalg.cond(matrix) > 1e15:
@@ -150,7 +151,10 @@ def transform(
         ("camera_scales", camera_scales, len(reconstruction.P)),
         ("point_scales", point_scales, len(reconstruction.Q)),
     ):
-        array = np.broadcast_to(np.asarray(value, dtype=np.float64), (count,))
+        array = as_real(name, value, f"a number or a ({count},) array")
+        if array.shape not in ((), (1,), (count,)):
+            raise ArgumentError(name, f"has shape {array.shape}", f"a number or ({count},)")
+        array = np.broadcast_to(array, (count,))
         if not np.isfinite(array).all() or (array == 0.0).any():
             raise ArgumentError(name, "has a zero or is not finite", "finite factors, none zero")
         scales.append(array)

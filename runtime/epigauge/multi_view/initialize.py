@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table, table
-from epigauge.linear import Dense, Levenberg
 from epigauge.multi_view.dampings import Covariant
 from epigauge.multi_view.gauge import normalized
 from epigauge.multi_view.problem import BundleProblem
+from epigauge.multi_view.resection import resect
 from epigauge.multi_view.system import Layout
-from epigauge.multi_view.tracks import MIN_POINTS, Reconstruction, Tracks
+from epigauge.multi_view.tracks import MIN_POINTS, MIN_VIEWS, Reconstruction, Tracks
 from epigauge.two_view.geometry import canonical_cameras
 from epigauge.two_view.losses import EFFICIENT, Loss, robust_scale
 from epigauge.two_view.refine import refine_fundamental
 
-__all__ = ["Frame", "initialize", "intersected", "resect"]
+__all__ = ["Frame", "initialize", "intersected"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -51,7 +51,10 @@ class Frame:
         sums = [np.bincount(tracks.view, tracks.xy[:, k]) / counts for k in (0, 1)]
         origins = np.stack(sums, axis=1)
         centred = tracks.xy - origins[tracks.view]
-        return Frame(origins, float(np.sqrt(np.mean(centred**2))))
+        scale = float(np.sqrt(np.mean(centred**2)))
+        if not scale > 0.0:
+            raise ArgumentError("tracks", "have all points of a view at one place", "other points")
+        return Frame(origins, scale)
 
     def conditioned(self, tracks: Tracks) -> Array:
         """Return the conditioned observations, shape (2, N)."""
@@ -142,15 +145,15 @@ def _homography_residual(x1: Array, x2: Array) -> float:
     """Return the median transfer error of the homography fitted to matches (DLT)."""
     scale = float(np.sqrt(np.mean(x1**2)))
     a, b = np.column_stack([x1 / scale, np.ones(len(x1))]), x2 / scale
-    zero = np.zeros_like(a)
-    rows = np.concatenate(
-        [
-            np.hstack([a, zero, -b[:, :1] * a]),
-            np.hstack([zero, a, -b[:, 1:] * a]),
-        ]
-    )
-    H = np.linalg.svd(np.linalg.qr(rows, mode="r"))[2][-1].reshape(3, 3)
-    h = a @ H.T
+    # Normal equations of rows (a, 0, -b_1 a) and (0, a, -b_2 a), block by block.
+    square = a.T @ a
+    across = [a.T @ (b[:, k, None] * a) for k in (0, 1)]
+    N = np.zeros((9, 9))
+    N[:3, :3] = N[3:6, 3:6] = square
+    N[:3, 6:], N[3:6, 6:] = -across[0], -across[1]
+    N[6:, :6] = N[:6, 6:].T
+    N[6:, 6:] = a.T @ (np.sum(b**2, axis=1)[:, None] * a)
+    h = a @ np.linalg.eigh(N)[1][:, 0].reshape(3, 3).T
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.linalg.norm(h[:, :2] / h[:, 2:] - b, axis=1)
     return float(np.median(np.nan_to_num(error, nan=0.0, posinf=0.0))) * scale
@@ -200,7 +203,8 @@ class _Builder:
         rows = np.flatnonzero((self.tracks.view == view) & self.known[self.tracks.point])
         self.P[view] = resect(self.kernels, self.q[:, rows], self.Q[self.tracks.point[rows]].T)
         self.registered[view] = True
-        self._triangulate()
+        # Points that it does not see are left as they are, but for a last round with all views.
+        self._triangulate(None if self.registered.all() else view)
         self._spread()
 
     def adjust(self) -> None:
@@ -212,22 +216,25 @@ class _Builder:
         q = np.ascontiguousarray(self.q[:, rows])
         problem = BundleProblem(self.kernels, layout, q, np.ones(len(rows)), Loss(), embedded=True)
         estimate = self.P[views], self.Q[points]
-        scale = EFFICIENT["cauchy"] * robust_scale(
-            np.linalg.norm(problem.evaluate(estimate).r, axis=0)
-        )
+        scale = EFFICIENT["cauchy"] * robust_scale(problem.engine.distances(*estimate))
         problem.loss = Loss("cauchy", max(scale, 1e-12))
         stopping = lm.Stopping(ftol=1e-3, xtol=0.0, gtol=0.0, max_iter=5)
         found = lm.minimize(problem, estimate, Covariant(), lm.Classic(), stopping)
         self.P[views], self.Q[points] = found.state.P, found.state.Q
         self._spread()
 
-    def _triangulate(self) -> None:
-        """Triangulate every point that two or more registered views see."""
-        usable = self.registered[self.tracks.view]
-        counts = np.bincount(self.tracks.point[usable], minlength=self.tracks.n_points)
-        rows = np.flatnonzero(usable & (counts[self.tracks.point] >= 2))
-        points, local = np.unique(self.tracks.point[rows], return_inverse=True)
-        layout = Layout(self.tracks.view[rows], local, self.tracks.n_views, len(points))
+    def _triangulate(self, view: int | None) -> None:
+        """Triangulate the points of a view, or all, that two or more registered views see."""
+        tracks = self.tracks
+        rows = np.flatnonzero(self.registered[tracks.view])
+        if view is not None:
+            seen = np.zeros(tracks.n_points, dtype=np.bool_)
+            seen[tracks.point[tracks.view == view]] = True
+            rows = rows[seen[tracks.point[rows]]]
+        counts = np.bincount(tracks.point[rows], minlength=tracks.n_points)
+        rows = rows[counts[tracks.point[rows]] >= MIN_VIEWS]
+        points, local = np.unique(tracks.point[rows], return_inverse=True)
+        layout = Layout(tracks.view[rows], local, tracks.n_views, len(points))
         q = np.ascontiguousarray(self.q[:, rows])
         problem = BundleProblem(self.kernels, layout, q, np.ones(len(rows)), Loss())
         self.Q[points] = _triangulated(self.P, self.Q[points], self.known[points], problem)
@@ -243,109 +250,17 @@ class _Builder:
 
 def intersected(P: Array, problem: BundleProblem) -> Array:
     """Return the points (m, 4) of least algebraic error: the lines of sight's linear meeting."""
-    layout, q = problem.layout, problem.q
-    cameras = P[layout.view]
-    gram = np.zeros((len(layout.view), 4, 4))
-    for k in (0, 1):
-        row = q[k][:, None] * cameras[:, 2] - cameras[:, k]
-        row = row / np.linalg.norm(row, axis=1, keepdims=True)
-        gram += row[:, :, None] * row[:, None, :]
-    return np.asarray(np.linalg.eigh(layout.sum_points(gram))[1][:, :, 0])
+    return problem.engine.intersected(P)
 
 
 def _triangulated(P: Array, Q: Array, known: NDArray[np.bool_], problem: BundleProblem) -> Array:
     """Return points triangulated linearly where new, then refined, with a robust loss."""
     linear = intersected(P, problem)
     Q = np.where(known[:, None], Q, linear)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        residuals = np.linalg.norm(problem.evaluate((P, linear)).r, axis=0)
-    scale = EFFICIENT["cauchy"] * robust_scale(np.nan_to_num(residuals, posinf=1e3))
+    distances = problem.engine.distances(P, linear)
+    scale = EFFICIENT["cauchy"] * robust_scale(np.nan_to_num(distances, posinf=1e3))
     problem.loss = Loss("cauchy", max(scale, 1e-12))
     # A known point may have been led astray by the new view's error: keep the better start.
-    costs = [_point_costs(problem, P, start) for start in (Q, linear)]
+    costs = [np.nan_to_num(problem.point_costs(P, start), nan=np.inf) for start in (Q, linear)]
     Q = np.where((costs[0] <= costs[1])[:, None], Q, linear)
     return problem.triangulated(P, Q)
-
-
-def _point_costs(problem: BundleProblem, P: Array, Q: Array) -> Array:
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        rho, _, _ = problem.loss(np.sum(problem.evaluate((P, Q)).r ** 2, axis=0))
-    return np.nan_to_num(problem.layout.sum_points(rho), nan=np.inf)
-
-
-@dataclass(frozen=True)
-class _CameraState:
-    P: Array
-    r: Array
-    J: Array
-    root: Array
-    cost: float
-
-
-class _Resection:
-    """One camera from known points, robustly."""
-
-    floor = 0.0
-
-    def __init__(self, kernels: Table, q: Array, Q: Array, loss: Loss) -> None:
-        self.kernels, self.q, self.Q, self.loss = kernels, q, Q, loss
-
-    def evaluate(self, P: Array) -> _CameraState:
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            q_hat, J, _, _ = self.kernels.project(P[..., None], self.Q)
-            r = self.q - q_hat
-            rho, first, _ = self.loss(np.sum(r**2, axis=0))
-            cost = 0.5 * float(np.sum(rho))
-        return _CameraState(P, r, J, np.sqrt(first), cost if np.isfinite(cost) else float("inf"))
-
-    def linearize(self, state: _CameraState) -> Dense:
-        J = (-state.root * state.J).transpose(1, 0, 2).reshape(12, -1)
-        N = J @ J.T
-        return Dense(J @ (state.root * state.r).ravel(), N, np.diag(N).copy())
-
-    def retract(self, state: _CameraState, step: Array) -> Array:
-        return state.P + step.reshape(3, 4)
-
-
-def resect(kernels: Table, q: Array, Q: Array) -> Array:
-    """Return the camera that projects points to measurements: linear, then robustly refined.
-
-    Parameters
-    ----------
-    kernels : Table
-        Backend.
-    q, Q : ndarray, shape (2, c), (4, c)
-        At least six measurements and points.
-
-    Returns
-    -------
-    ndarray, shape (3, 4)
-        Camera of unit norm.
-    """
-    weights = np.ones(q.shape[1])
-    P = _linear_camera(q, Q, weights)
-    for _ in range(5):
-        residuals = np.linalg.norm(_Resection(kernels, q, Q, Loss()).evaluate(P).r, axis=0)
-        scale = EFFICIENT["cauchy"] * max(robust_scale(residuals), 1e-12)
-        problem = _Resection(kernels, q, Q, Loss("cauchy", scale))
-        found = lm.minimize(problem, P, Levenberg(), lm.Classic(), lm.Stopping(ftol=1e-6))
-        change = found.state.P / np.linalg.norm(found.state.P) - P / np.linalg.norm(P)
-        P = found.state.P
-        if np.linalg.norm(change) < 1e-8:
-            break
-    return np.asarray(P / np.linalg.norm(P))
-
-
-def _linear_camera(q: Array, Q: Array, weights: Array) -> Array:
-    """Return the camera of least algebraic error, with points in a basis that spreads them."""
-    there = normalized().transformation(np.zeros((0, 3, 4)), Q.T)
-    points = there.apply(np.zeros((0, 3, 4)), Q.T)[1]
-    zero = np.zeros_like(points)
-    rows = np.concatenate(
-        [
-            np.hstack([points, zero, -q[0][:, None] * points]),
-            np.hstack([zero, points, -q[1][:, None] * points]),
-        ]
-    )
-    camera = np.linalg.svd(np.linalg.qr(rows, mode="r"))[2][-1].reshape(3, 4)
-    return np.asarray(camera @ np.linalg.inv(there.T))

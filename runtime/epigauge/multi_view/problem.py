@@ -2,51 +2,70 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
+from operator import is_
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.kernels import Table
-from epigauge.multi_view.system import BundleSystem, Layout
+from epigauge.multi_view.engine import Engine, Reference, Triangulation
+from epigauge.multi_view.fused import Fused
+from epigauge.multi_view.layout import Layout
+from epigauge.multi_view.system import BundleSystem
 from epigauge.two_view.losses import Loss
 
 __all__ = ["BundleProblem", "BundleState", "Linearized"]
 
 Array = NDArray[np.float64]
 
-#: Embedded point iterations a trial, and the first and the factor of their damping.
-_POINT_ITERATIONS = 5
-_POINT_LAM, _POINT_FACTOR = 1e-3, 10.0
-
-#: Least weight in the normal equations, of the largest: what only observations without weight (or
-#: beyond a truncated loss) determine stays determined, and does not influence the rest.
-_LEAST_WEIGHT = 1e-8
-
 
 @dataclass(frozen=True)
 class BundleState:
-    """Cameras and points with residuals, Jacobians, root weights and cost.
+    """Cameras and points with their cost; what else is asked for is computed then.
 
     Attributes
     ----------
     P, Q : ndarray, shape (n, 3, 4), (m, 4)
         The estimate.
-    r, J_P, J_Q : ndarray, shape (2, N), (2, 12, N), (2, 4, N)
-        Residuals r = q - q_hat and the Jacobians of q_hat.
-    root : ndarray, shape (N,)
-        Root of each observation's weight, that of the robust loss included.
     cost : float
         0.5 * weighted robust sum.
+    problem : BundleProblem
+        What it was evaluated by.
     """
 
     P: Array
     Q: Array
-    r: Array
-    J_P: Array
-    J_Q: Array
-    root: Array
     cost: float
+    problem: BundleProblem
+
+    @property
+    def r(self) -> Array:
+        """Return the residuals r = q - q_hat, (2, N)."""
+        return self.problem.by_observation.residuals(self.P, self.Q)
+
+    @property
+    def J_P(self) -> Array:
+        """Return the Jacobians of q_hat by the camera, (2, 12, N)."""
+        return self.problem.by_observation.jacobians(self.P, self.Q)[0]
+
+    @property
+    def J_Q(self) -> Array:
+        """Return the Jacobians of q_hat by the point, (2, 4, N)."""
+        return self.problem.by_observation.jacobians(self.P, self.Q)[1]
+
+    @property
+    def root(self) -> Array:
+        """Return the root of each observation's weight, that of the robust loss included, (N,)."""
+        return self.problem.by_observation.roots(self.r)
+
+    @cached_property
+    def depth_blocks(self) -> tuple[Array, Array]:
+        """Return the diagonal blocks of Z^T Z, Z = d log depth / d(P, Q) weighted as residuals."""
+        return self.problem.engine.depth_blocks(self.P, self.Q)
 
 
 @dataclass(frozen=True)
@@ -74,7 +93,11 @@ class BundleProblem:
         Applied to each squared residual.
     embedded : bool
         After each step re-triangulate every point (variable projection).
+    workers : int
+        Threads to use where the back end can.
     """
+
+    triangulation = Triangulation()
 
     def __init__(
         self,
@@ -84,52 +107,57 @@ class BundleProblem:
         weights: Array,
         loss: Loss,
         embedded: bool = False,
+        workers: int = 1,
     ) -> None:
         self.kernels, self.layout = kernels, layout
         self.q, self.weights, self.loss = q, weights, loss
-        self.embedded = embedded
+        self.embedded, self.workers = embedded, workers
         # Conditioned coordinates are of order one; products of P and Q round a few times.
         self.floor = 0.5 * float(np.sum(weights)) * 1e-28
+        self._fused: Fused | None = None
+        #: Cameras and points last triangulated, and the points' costs.
+        self._costs: tuple[Any, ...] | None = None
+
+    @property
+    def by_observation(self) -> Reference:
+        """Return the evaluation by the kernels of any back end, observation by observation."""
+        return Reference(self.kernels, self.layout, self.q, self.weights, self.loss)
+
+    @property
+    def engine(self) -> Engine:
+        """Return what evaluates: one pass a point in C, or the reference."""
+        if self.kernels.name != "c":
+            return self.by_observation
+        made = self._fused
+        if made is None or made.q is not self.q or made.weights is not self.weights:
+            made = Fused(self.layout, self.q, self.weights, self.loss, self.workers)
+        elif made.loss is not self.loss:
+            made = made.with_loss(self.loss)
+        self._fused = made
+        return made
 
     def evaluate(self, estimate: tuple[Array, Array]) -> BundleState:
         """Return the state of cameras and points."""
         P, Q = estimate
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            # A point may fall onto a focal plane: the trial is then rejected by its cost.
-            r, J_P, J_Q = self._project(P, Q)
-            rho, first, _ = self.loss(np.sum(r**2, axis=0))
-            cost = 0.5 * float(np.sum(self.weights * rho))
-        cost = cost if np.isfinite(cost) else float("inf")
-        return BundleState(P, Q, r, J_P, J_Q, np.sqrt(self._effective(first)), cost)
+        known = self._known(P, Q)
+        costs = self.point_costs(P, Q) if known is None else known
+        with np.errstate(over="ignore"):
+            cost = 0.5 * float(costs.sum())
+        # A point may fall onto a focal plane: the trial is then rejected by its cost.
+        return BundleState(P, Q, cost if math.isfinite(cost) else float("inf"), self)
 
     def linearize(self, state: BundleState) -> Linearized:
         """Return the normal equations."""
-        with np.errstate(invalid="ignore", over="ignore"):
-            # A start with a point in a focal plane has no finite blocks; its cost stops the run.
-            return self._linearized(state)
-
-    def _linearized(self, state: BundleState) -> Linearized:
-        A = -state.root * state.J_P
-        B = -state.root * state.J_Q
-        r = state.root * state.r
-        layout = self.layout
-        by_view = np.ascontiguousarray(A[:, :, layout.by_view])
-        U = np.empty((layout.n_views, 12, 12))
-        for i in range(layout.n_views):
-            rows = slice(layout.first_in_view[i], layout.first_in_view[i + 1])
-            J = by_view[:, :, rows].transpose(1, 0, 2).reshape(12, -1)
-            U[i] = J @ J.T
-        J_camera, J_point = A.transpose(2, 0, 1), B.transpose(2, 0, 1)
-        J_camera_T = np.swapaxes(J_camera, 1, 2)
-        J_point_T = np.swapaxes(J_point, 1, 2)
-        residual = r.T[..., None]
+        normal = self.engine.linearize(state.P, state.Q)
+        if normal.depth_blocks is not None:
+            state.__dict__["depth_blocks"] = normal.depth_blocks
         return Linearized(
-            layout,
-            U=U,
-            V=layout.sum_points(J_point_T @ J_point),
-            W=J_camera_T @ J_point,
-            g_cameras=layout.sum_views((J_camera_T @ residual)[..., 0]),
-            g_points=layout.sum_points((J_point_T @ residual)[..., 0]),
+            self.layout,
+            normal.U,
+            normal.V,
+            normal.coupling,
+            normal.g_cameras,
+            normal.g_points,
             problem=self,
             state=state,
         )
@@ -142,71 +170,24 @@ class BundleProblem:
 
     def depth_blocks(self, state: BundleState) -> tuple[Array, Array]:
         """Return the diagonal blocks of Z^T Z, Z = d log depth / d(P, Q) weighted as residuals."""
-        Z_P, Z_Q = (state.root * Z for Z in self._log_depths(state.P, state.Q))
-        # A depth depends on the last row of its camera only.
-        row = Z_P[8:].T
-        cameras = np.zeros((self.layout.n_views, 12, 12))
-        cameras[:, 8:, 8:] = self.layout.sum_views(row[:, :, None] * row[:, None, :])
-        return cameras, self.layout.sum_points(Z_Q.T[:, :, None] * Z_Q.T[:, None, :])
+        return state.depth_blocks
+
+    def point_costs(self, P: Array, Q: Array) -> Array:
+        """Return the weighted robust sum of each point, (m,); not finite in a focal plane."""
+        return self.engine.point_costs(P, Q)
 
     def triangulated(self, P: Array, Q: Array) -> Array:
         """Return the points after a few covariantly damped Gauss-Newton iterations of their own."""
-        layout = self.layout
-        lam = np.full(layout.n_points, _POINT_LAM)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            r, _, J = self._project(P, Q)
-            cost, weight = self._point_costs(r)
-            if not np.isfinite(cost).all():
-                return Q
-            for _ in range(_POINT_ITERATIONS):
-                B = np.sqrt(weight) * J
-                V = layout.sum_points(np.einsum("ikn,iln->nkl", B, B))
-                g = -layout.sum_points(np.einsum("ikn,in->nk", B, np.sqrt(weight) * r))
-                Z = np.sqrt(weight) * self._log_depths(P, Q)[1]
-                damping = V + layout.sum_points(Z.T[:, :, None] * Z.T[:, None, :])
-                trial = Q - _solved(V + lam[:, None, None] * damping, g)
-                r_trial, _, J_trial = self._project(P, trial)
-                cost_trial, weight_trial = self._point_costs(r_trial)
-                better = cost_trial < cost
-                if not better.any():
-                    lam *= _POINT_FACTOR
-                    continue
-                rows = better[layout.point]
-                Q = np.where(better[:, None], trial, Q)
-                r, J = np.where(rows, r_trial, r), np.where(rows, J_trial, J)
-                weight = np.where(rows, weight_trial, weight)
-                settled = np.all(cost - np.where(better, cost_trial, cost) <= 1e-12 * cost)
-                cost = np.where(better, cost_trial, cost)
-                lam = np.where(better, lam / _POINT_FACTOR, lam * _POINT_FACTOR)
-                if settled:
-                    break
+        Q, costs = self.engine.triangulated(P, Q, self.triangulation)
+        self._costs = (costs, *self._given(P, Q))
         return Q
 
-    def _point_costs(self, r: Array) -> tuple[Array, Array]:
-        rho, first, _ = self.loss(np.sum(r**2, axis=0))
-        return self.layout.sum_points(self.weights * rho), self._effective(first)
+    def _given(self, P: Array, Q: Array) -> tuple[object, ...]:
+        return P, Q, self.q, self.weights, self.loss, self.kernels
 
-    def _effective(self, first: Array) -> Array:
-        least = _LEAST_WEIGHT * float(np.max(self.weights))
-        return np.asarray(np.maximum(self.weights * first, least))
-
-    def _project(self, P: Array, Q: Array) -> tuple[Array, Array, Array]:
-        cameras, points = self._gathered(P, Q)
-        q_hat, J_P, J_Q, _ = self.kernels.project(cameras, points)
-        return self.q - q_hat, J_P, J_Q
-
-    def _log_depths(self, P: Array, Q: Array) -> tuple[Array, Array]:
-        Z_P, Z_Q = self.kernels.log_depth_derivatives(*self._gathered(P, Q))
-        return Z_P, Z_Q
-
-    def _gathered(self, P: Array, Q: Array) -> tuple[Array, Array]:
-        cameras = np.ascontiguousarray(P.transpose(1, 2, 0)[:, :, self.layout.view])
-        return cameras, np.ascontiguousarray(Q.T[:, self.layout.point])
-
-
-def _solved(A: Array, b: Array) -> Array:
-    """Return A^-1 b for each of many symmetric systems, A^+ b where one is singular to rounding."""
-    try:
-        return np.asarray(np.linalg.solve(A, b[..., None])[..., 0])
-    except np.linalg.LinAlgError:
-        return np.asarray((np.linalg.pinv(A, hermitian=True) @ b[..., None])[..., 0])
+    def _known(self, P: Array, Q: Array) -> Array | None:
+        """Return the costs of points that were triangulated just now."""
+        if self._costs is None:
+            return None
+        costs, *given = self._costs
+        return costs if all(map(is_, given, self._given(P, Q))) else None

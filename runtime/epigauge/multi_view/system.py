@@ -2,67 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.multi_view.coupling import Coupling, StoredCoupling, solved
+from epigauge.multi_view.layout import Layout
+
 __all__ = ["BundleSystem", "Layout"]
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-
-#: Points are eliminated in chunks of about this many matrix entries, which bounds the memory.
-_CHUNK = 4_000_000
-
-#: Up to this many cameras the reduced system is dense; beyond, conjugate gradients on the implicit
-#: Schur complement.
-DENSE_CAMERAS = 300
-
-_CG_TOLERANCE = 1e-10
-_CG_ITERATIONS = 2000
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Which observation belongs to which camera and point; sorted by point, then view.
-
-    Attributes
-    ----------
-    view, point : ndarray of int, shape (N,)
-        Indices.
-    n_views, n_points : int
-        Numbers of cameras and points; every index is used.
-    """
-
-    view: Indices
-    point: Indices
-    n_views: int
-    n_points: int
-
-    @cached_property
-    def first(self) -> Indices:
-        """Return the first observation of each point, and N."""
-        return np.searchsorted(self.point, np.arange(self.n_points + 1))
-
-    @cached_property
-    def by_view(self) -> Indices:
-        """Return the observations sorted by view."""
-        return np.argsort(self.view, kind="stable")
-
-    @cached_property
-    def first_in_view(self) -> Indices:
-        """Return where each view starts in `by_view`, and N."""
-        return np.searchsorted(self.view[self.by_view], np.arange(self.n_views + 1))
-
-    def sum_points(self, values: Array) -> Array:
-        """Add up values (N, ...) over the observations of each point."""
-        return np.add.reduceat(values, self.first[:-1], axis=0)
-
-    def sum_views(self, values: Array) -> Array:
-        """Add up values (N, ...) over the observations of each view."""
-        return np.add.reduceat(values[self.by_view], self.first_in_view[:-1], axis=0)
 
 
 @dataclass(frozen=True)
@@ -77,8 +29,8 @@ class BundleSystem:
         Camera blocks.
     V : ndarray, shape (m, b, b)
         Point blocks.
-    W : ndarray, shape (N, a, b)
-        Coupling of each observation's camera and point.
+    W : ndarray, shape (N, a, b), or Coupling
+        Coupling of each observation's camera and point, or what multiplies by it unseen.
     g_cameras, g_points : ndarray, shape (n, a), (m, b)
         Gradient.
     border : tuple of ndarray, optional
@@ -88,10 +40,17 @@ class BundleSystem:
     layout: Layout
     U: Array
     V: Array
-    W: Array
+    W: Array | Coupling
     g_cameras: Array
     g_points: Array
     border: tuple[Array, Array] | None = None
+    #: The last step made by `whitened_step`, and the decrease that it promises.
+    _made: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
+
+    @cached_property
+    def coupling(self) -> Coupling:
+        """Return what multiplies by the coupling."""
+        return StoredCoupling(self.layout, self.W) if isinstance(self.W, np.ndarray) else self.W
 
     @cached_property
     def gradient(self) -> Array:
@@ -119,11 +78,10 @@ class BundleSystem:
     def product(self, step: Array) -> Array:
         """Return J^T J times a vector."""
         x, y = self.split(step)
-        view, point = self.layout.view, self.layout.point
         cameras = np.einsum("nij,nj->ni", self.U, x)
-        cameras += self.layout.sum_views(np.einsum("nij,nj->ni", self.W, y[point]))
+        cameras += self.coupling.times_points(y[..., None])[..., 0]
         points = np.einsum("nij,nj->ni", self.V, y)
-        points += self.layout.sum_points(np.einsum("nij,ni->nj", self.W, x[view]))
+        points += self.coupling.times_cameras(x[..., None])[..., 0]
         if self.border is not None:
             Bc, Bp = self.border
             along = np.einsum("nir,ni->r", Bc, x) + np.einsum("nir,ni->r", Bp, y)
@@ -132,6 +90,8 @@ class BundleSystem:
 
     def predicted(self, step: Array) -> float:
         """Return -(g^T step + step^T N step / 2)."""
+        if self._made and self._made[0] is step:
+            return float(self._made[1])
         return float(-(self.gradient @ step + 0.5 * step @ self.product(step)))
 
     def damped(self, W_cameras: Array, W_points: Array) -> BundleSystem:
@@ -143,12 +103,11 @@ class BundleSystem:
 
         A column of zeros freezes a parameter: its diagonal entry becomes one.
         """
-        B_view, B_point = B_cameras[self.layout.view], B_points[self.layout.point]
         return replace(
             self,
             U=_congruent(B_cameras, self.U),
             V=_congruent(B_points, self.V),
-            W=np.swapaxes(B_view, 1, 2) @ self.W @ B_point,
+            W=self.coupling.transformed(B_cameras, B_points),
             g_cameras=np.einsum("nij,ni->nj", B_cameras, self.g_cameras),
             g_points=np.einsum("nij,ni->nj", B_points, self.g_points),
             border=None
@@ -175,6 +134,30 @@ class BundleSystem:
         x, y = x[..., :1] - x[..., 1:] @ shift, y[..., :1] - y[..., 1:] @ shift
         return np.concatenate([x.ravel(), y.ravel()])
 
+    def whitened_step(self, W: tuple[Array, Array], lam: float) -> Array:
+        """Return -(J^T J + lam W)^-1 g, solved by parameters in which W = I.
+
+        There its condition is about |W^-1 J^T J| / lam whatever the basis; a basis far from the one
+        that suits the problem would cost digits, and the step its invariance.
+        """
+        if self.border is None:
+            made = self.coupling.whitened_step(
+                self.U, self.V, self.g_cameras, self.g_points, W, lam
+            )
+            if made is not None:
+                step, energy = made
+                # step^T J^T J step = -g^T step - lam step^T W step.
+                promised = 0.5 * (lam * energy - float(self.gradient @ step))
+                self._made[:] = [step, promised]
+                return step
+        roots = [np.swapaxes(np.linalg.cholesky(blocks), 1, 2) for blocks in W]
+        whitening = (np.linalg.inv(roots[0]), np.linalg.inv(roots[1]))
+        white = self.transformed(*whitening)
+        shifts = (lam * np.broadcast_to(np.eye(B.shape[1]), B.shape) for B in (white.U, white.V))
+        x, y = white.split(white.damped(*shifts).solve())
+        cameras, points = whitening[0] @ x[..., None], whitening[1] @ y[..., None]
+        return np.concatenate([cameras.ravel(), points.ravel()])
+
     def solve_grounded(self, moves: Array) -> Array:
         """Return -(J^T J + moves moves^T)^-1 g, moves (n a, r) acting on the cameras only.
 
@@ -188,70 +171,23 @@ class BundleSystem:
         self, cameras: Array, points: Array, moves: Array | None = None
     ) -> tuple[Array, Array]:
         """Apply the inverse of the part without border to right-hand sides (n, a, r), (m, b, r)."""
-        layout = self.layout
-        V_inverse = np.linalg.inv(self.V)
-        Y = self.W @ V_inverse[layout.point]
-        right = cameras - layout.sum_views(Y @ points[layout.point])
+        coupling = self.coupling
+        roots = coupling.inverse_roots(self.V)
+        half = np.swapaxes(roots, 1, 2) @ points
+        right = cameras - coupling.times_points(roots @ half)
+        reduced = coupling.reduced(self.U, roots)
         n, a, r = right.shape
         x: Array
-        if n <= DENSE_CAMERAS or moves is not None:
-            S = self._reduced_matrix()
-            if moves is not None:
-                S += moves @ moves.T
+        if moves is not None:
+            S = reduced.matrix() + moves @ moves.T
             x = np.asarray(np.linalg.solve(S, right.reshape(n * a, r))).reshape(n, a, r)
         else:
-            x = np.stack([self._conjugate_gradients(Y, right[..., k]) for k in range(r)], axis=2)
-        coupled = layout.sum_points(np.swapaxes(self.W, 1, 2) @ x[layout.view])
-        return x, V_inverse @ (points - coupled)
+            x = solved(reduced, right)
+        return x, roots @ (half - np.swapaxes(roots, 1, 2) @ coupling.times_cameras(x))
 
     def _reduced_matrix(self) -> Array:
         """Return the Schur complement U - W V^-1 W^T, dense, (n a, n a)."""
-        layout = self.layout
-        n, a, b = len(self.U), self.U.shape[1], self.V.shape[1]
-        S = np.zeros((n, a, n, a))
-        S[np.arange(n), :, np.arange(n), :] = self.U
-        # V^-1 = T T^T, so that each chunk of points is one symmetric product.
-        T = np.swapaxes(np.linalg.inv(np.linalg.cholesky(self.V)), 1, 2)
-        half = self.W @ T[layout.point]
-        size = max(1, _CHUNK // (n * a * b))
-        for begin in range(0, layout.n_points, size):
-            end = min(begin + size, layout.n_points)
-            rows = slice(layout.first[begin], layout.first[end])
-            seen, where = np.unique(layout.view[rows], return_inverse=True)
-            block = np.zeros((len(seen), a, end - begin, b))
-            block[where, :, layout.point[rows] - begin, :] = half[rows]
-            flat = block.reshape(len(seen) * a, -1)
-            update = (flat @ flat.T).reshape(len(seen), a, len(seen), a)
-            S[seen[:, None], :, seen[None, :], :] -= update.transpose(0, 2, 1, 3)
-        return S.reshape(n * a, n * a)
-
-    def _conjugate_gradients(self, Y: Array, right: Array) -> Array:
-        """Solve the reduced system without forming it, preconditioned by its diagonal blocks."""
-        layout = self.layout
-        diagonal = self.U - layout.sum_views(Y @ np.swapaxes(self.W, 1, 2))
-        inverse = np.linalg.inv(diagonal)
-
-        def reduced(x: Array) -> Array:
-            inner = layout.sum_points(np.einsum("nij,ni->nj", Y, x[layout.view]))
-            outer = layout.sum_views(np.einsum("nij,nj->ni", self.W, inner[layout.point]))
-            return np.asarray(np.einsum("nij,nj->ni", self.U, x) - outer)
-
-        x = np.zeros_like(right)
-        residual = right.copy()
-        z = np.einsum("nij,nj->ni", inverse, residual)
-        direction, energy = z, float(np.sum(residual * z))
-        goal = _CG_TOLERANCE**2 * energy
-        for _ in range(_CG_ITERATIONS):
-            if energy <= goal:
-                break
-            image = reduced(direction)
-            length = energy / float(np.sum(direction * image))
-            x = x + length * direction
-            residual = residual - length * image
-            z = np.einsum("nij,nj->ni", inverse, residual)
-            previous, energy = energy, float(np.sum(residual * z))
-            direction = z + (energy / previous) * direction
-        return x
+        return self.coupling.reduced(self.U, self.coupling.inverse_roots(self.V)).matrix()
 
 
 def _congruent(B: Array, blocks: Array) -> Array:

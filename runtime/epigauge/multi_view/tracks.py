@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epigauge._arguments import as_weights
+from epigauge._arguments import MAX_PX, MIN_PX, as_array, as_double, as_weights
 from epigauge.errors import ArgumentError
 
 __all__ = ["Reconstruction", "Tracks"]
@@ -17,6 +17,9 @@ Indices = NDArray[np.intp]
 
 #: A view needs this many points, a point this many views, for its parameters to be determined.
 MIN_POINTS, MIN_VIEWS = 6, 2
+
+#: Size of a camera or a point, its largest entry: products of others overflow.
+MIN_SIZE, MAX_SIZE = 1e-100, 1e100
 
 
 class Tracks:
@@ -59,24 +62,28 @@ class Tracks:
         weights: ArrayLike | None = None,
     ) -> None:
         views, points = _indices("view", view), _indices("point", point)
-        pixels = np.asarray(xy)
+        pixels = as_array("xy", xy, "an (N, 2) array")
         if pixels.dtype.kind not in "iuf" or pixels.shape != (len(views), 2):
             raise ArgumentError(
                 "xy", f"is {pixels.dtype} {pixels.shape}", f"real numbers, ({len(views)}, 2)"
             )
+        pixels = as_double(pixels)
         if len(points) != len(views):
             raise ArgumentError("point", f"has {len(points)} rows", f"{len(views)}, as view")
         if not len(views):
             raise ArgumentError("view", "is empty", "at least one observation")
-        bad = np.flatnonzero(~np.isfinite(pixels).all(axis=1))
+        bad = np.flatnonzero(~(np.abs(pixels) <= MAX_PX).all(axis=1))
         if len(bad):
-            raise ArgumentError("xy", f"is not finite in row {bad[0]}", "finite pixels")
+            what = "too large" if np.isfinite(pixels[bad[0]]).all() else "not finite"
+            raise ArgumentError("xy", f"is {what} in row {bad[0]}", f"pixels below {MAX_PX:g}")
+        if 0.0 < np.abs(pixels).max() < MIN_PX:
+            raise ArgumentError("xy", f"is nowhere beyond {MIN_PX:g}", "another unit of length")
         self.n_views = _extent("view", views, n_views)
         self.n_points = _extent("point", points, n_points)
         self.order: Indices = np.lexsort((views, points))
         self.view: Indices = views[self.order]
         self.point: Indices = points[self.order]
-        self.xy: Array = pixels[self.order].astype(np.float64)
+        self.xy: Array = np.ascontiguousarray(pixels[self.order])
         w = np.ones(len(views)) if weights is None else as_weights(weights, len(views))
         self.weights: Array = w[self.order]
         self._check()
@@ -101,7 +108,16 @@ class Tracks:
         views, points : ndarray of int
             Old numbers of the views and points left.
         """
-        views, points, pixels = _indices("view", view), _indices("point", point), np.asarray(xy)
+        views, points = _indices("view", view), _indices("point", point)
+        pixels = as_array("xy", xy, "an (N, 2) array")
+        w = np.ones(len(views)) if weights is None else as_weights(weights, len(views))
+        lengths = len(views), len(points), len(np.atleast_1d(pixels))
+        if len(set(lengths)) > 1:
+            have = "have {}, {} and {} rows".format(*lengths)
+            raise ArgumentError("view, point, xy", have, "one row an observation")
+        # Without gaps first: what is counted below has one entry a number.
+        all_views, views = np.unique(views, return_inverse=True)
+        all_points, points = np.unique(points, return_inverse=True)
         keep = np.ones(len(views), dtype=np.bool_)
         while keep.any():
             per_view, per_point = np.bincount(views[keep]), np.bincount(points[keep])
@@ -114,8 +130,8 @@ class Tracks:
             keep = strong
         old_views, new_views = np.unique(views[keep], return_inverse=True)
         old_points, new_points = np.unique(points[keep], return_inverse=True)
-        w = None if weights is None else np.asarray(weights)[keep]
-        return cls(new_views, new_points, pixels[keep], weights=w), old_views, old_points
+        tracks = cls(new_views, new_points, pixels[keep], weights=w[keep])
+        return tracks, all_views[old_views], all_points[old_points]
 
     def __len__(self) -> int:
         """Return the number of observations."""
@@ -203,7 +219,7 @@ class Reconstruction:
             In the tracks' order; infinite or NaN for points in a camera's focal plane.
         """
         h = np.einsum("nij,nj->ni", self.P[tracks.view], self.Q[tracks.point])
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             return np.asarray(h[:, :2] / h[:, 2:])
 
     def rms_px(self, tracks: Tracks) -> float:
@@ -219,30 +235,34 @@ class Reconstruction:
         float
             sqrt(sum of squared residual coordinates / (2 N)), in pixels.
         """
-        return float(np.sqrt(np.mean((tracks.xy - self.project(tracks)) ** 2)))
+        with np.errstate(over="ignore"):
+            return float(np.sqrt(np.mean((tracks.xy - self.project(tracks)) ** 2)))
 
 
 def _homogeneous(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Return homogeneous matrices or vectors, of any scale but zero."""
-    array = np.asarray(value)
+    array = as_array(name, value, "a regular array")
     if array.dtype.kind not in "iuf" or array.shape[1:] != shape or array.ndim == 0:
         needed = ", ".join(map(str, shape))
         raise ArgumentError(name, f"is {array.dtype} {array.shape}", f"real numbers, (n, {needed})")
-    rows = array.reshape(len(array), -1)
-    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1) | ~rows.any(axis=1))
+    array = np.ascontiguousarray(as_double(array))
+    size = np.abs(array).max(axis=tuple(range(1, array.ndim)))
+    bad = np.flatnonzero(~((size >= MIN_SIZE) & (size <= MAX_SIZE)))
     if len(bad):
-        raise ArgumentError(name, f"is zero or not finite in row {bad[0]}", "finite, not all zero")
-    return array.astype(np.float64, copy=False)
+        row = bad[0]
+        what = f"of size {size[row]:g}" if np.isfinite(size[row]) else "not finite"
+        needed = f"a largest entry between {MIN_SIZE:g} and {MAX_SIZE:g}"
+        raise ArgumentError(name, f"is {what} in row {row}", needed)
+    return array
 
 
 def _indices(name: str, value: ArrayLike) -> Indices:
-    indices = np.asarray(value)
+    indices = as_array(name, value, "an (N,) array")
     if indices.ndim != 1 or indices.dtype.kind not in "iu":
         raise ArgumentError(name, f"is {indices.dtype} {indices.shape}", "integers, (N,)")
-    negative = np.flatnonzero(indices < 0)
-    if len(negative):
-        row = negative[0]
-        raise ArgumentError(name, f"is {indices[row]} in row {row}", "indices from 0")
+    bad = np.flatnonzero((indices < 0) | (indices > np.iinfo(np.intp).max))
+    if len(bad):
+        raise ArgumentError(name, f"is {indices[bad[0]]} in row {bad[0]}", "indices from 0")
     return indices.astype(np.intp)
 
 
@@ -252,9 +272,12 @@ def _extent(name: str, indices: Indices, given: int | None) -> int:
         row = int(np.argmax(indices))
         raise ArgumentError(name, f"is {indices[row]} in row {row}", f"indices below {given}")
     extent = extent if given is None else given
-    unused = np.flatnonzero(np.bincount(indices, minlength=extent) == 0)
-    if len(unused):
+    # No more indices than there are rows can be used: nothing longer is allocated.
+    counts = np.bincount(indices[indices < len(indices)], minlength=min(extent, len(indices)))
+    unused = np.flatnonzero(counts[:extent] == 0)
+    if len(unused) or extent > len(indices):
+        first = unused[0] if len(unused) else len(indices)
         raise ArgumentError(
-            name, f"never is {unused[0]}", "every index used, or Tracks.pruned(...) to renumber"
+            name, f"never is {first}", "every index used, or Tracks.pruned(...) to renumber"
         )
     return extent

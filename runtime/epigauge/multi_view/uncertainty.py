@@ -328,12 +328,13 @@ class _Inverse:
                 "is not determined by the tracks (singular normal equations)",
                 "cameras and points in general position, at a minimum",
             ) from None
-        Y = white.W @ V_inverse[problem.layout.point]
+        W = white.coupling.blocks()
+        Y = W @ V_inverse[problem.layout.point]
         return _Inverse(
             problem.layout,
             0.5 * (cameras + cameras.T),
             V_inverse,
-            white.W,
+            W,
             Y,
             whitening,
             state,

@@ -1,0 +1,112 @@
+"""The functions of runtime/c/bundle*.c as ctypes calls them."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge._library import library
+
+__all__ = [
+    "CAMERA",
+    "LANES",
+    "LOSSES",
+    "PAIR",
+    "Bundle",
+    "address",
+    "aligned_zeros",
+    "checked",
+    "function",
+]
+
+Array = NDArray[np.float64]
+
+#: As in bundle.h.
+LANES, CAMERA, PAIR = 8, 96, 112
+LOSSES = ("linear", "huber", "soft_l1", "cauchy", "truncated")
+
+_P, _N, _D, _I = ctypes.c_void_p, ctypes.c_ssize_t, ctypes.c_double, ctypes.c_int
+
+
+class Bundle(ctypes.Structure):
+    """The eg_bundle of bundle.h."""
+
+    _fields_ = (
+        ("n_views", _N),
+        ("n_points", _N),
+        ("n_chunks", _N),
+        ("lanes", _P),
+        ("rows", _P),
+        ("point", _P),
+        ("count", _P),
+        ("view", _P),
+        ("q", _P),
+        ("weights", _P),
+        ("least", _D),
+        ("scale2", _D),
+        ("loss", _N),
+    )
+
+
+#: Results and arguments. The first three of most are the bundle and a range of its chunks.
+_RANGE = (_P, _N, _N)
+_TYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "bundle_pack": (None, (_P,) * 8),
+    "bundle_costs": (_I, (*_RANGE, *[_P] * 3)),
+    "bundle_linearize": (_I, (*_RANGE, *[_P] * 6)),
+    "bundle_triangulate": (_I, (*_RANGE, *[_P] * 3, _N, _D, _D, _D)),
+    "bundle_inverse_roots": (_I, (_N, _P, _P, _D, _P, _P, _P)),
+    "bundle_schur": (_I, (*_RANGE, *[_P] * 7)),
+    "bundle_couple": (_I, (*_RANGE, *[_P] * 7)),
+    "bundle_point_steps": (_D, (_N, *[_P] * 5)),
+    "bundle_camera_blocks": (None, (_N, *[_P] * 4)),
+    "bundle_whiten": (_I, (_N, _P, _P, _D, _P, _P)),
+    "bundle_reduce": (None, (_P,) * 5),
+    "bundle_neighbours": (None, (_P, _P)),
+    "bundle_intersect": (_I, (*_RANGE, _P, _P)),
+    "bundle_distances": (_I, (*_RANGE, *[_P] * 4)),
+    "spreading_basis": (_I, (_N, _P, _P)),
+    "resect": (_I, (_N, _P, _P, _D, _D, _N, _P)),
+    "bundle_step": (_I, (*[_P] * 10, _D, _P, _P)),
+    "envelope_factor": (_I, (_P, _P)),
+    "envelope_solve": (None, (_P, _P, _N, _P)),
+}
+
+_byte = ctypes.c_char.from_buffer
+_address = ctypes.addressof
+
+
+@cache
+def function(name: str) -> Any:
+    """Return a function of the C library; calls release the global interpreter lock."""
+    found = getattr(library(), f"eg_{name}")
+    found.restype, found.argtypes = _TYPES[name]
+    return found
+
+
+def address(array: Any) -> int | None:
+    """Return the address of a contiguous array, None of None; keep the array while it is used."""
+    if array is None:
+        return None
+    try:  # twice as fast as what NumPy offers, but for writable arrays only
+        return _address(_byte(array))
+    except (TypeError, ValueError):
+        return int(array.__array_interface__["data"][0])
+
+
+def checked(status: int) -> None:
+    """Raise what a status other than zero means: there was no memory."""
+    if status:
+        raise MemoryError("no memory for the observations of a few points")
+
+
+def aligned_zeros(shape: tuple[int, ...]) -> Array:
+    """Return zeros that begin at a cache line."""
+    size = int(np.prod(shape))
+    whole = np.zeros(size + 8)
+    begin = -int(address(whole) or 0) // 8 % 8
+    return whole[begin : begin + size].reshape(shape)

@@ -1,0 +1,116 @@
+"""The observations in the order in which the C library passes over them."""
+
+from __future__ import annotations
+
+import ctypes
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.multi_view._native import LANES, LOSSES, Bundle, address, function
+from epigauge.multi_view.engine import LEAST_WEIGHT
+from epigauge.multi_view.envelope import Envelope, narrow
+from epigauge.multi_view.layout import Layout
+from epigauge.two_view.losses import Loss
+
+__all__ = ["Packed"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: Observations a chunk, so that it stays in the fast cache, and the most lanes.
+_ROWS, _MOST_LANES = 384, 56
+
+#: What the passes over an observation cost, in pairs of observations.
+_PASSES = 20
+
+#: Beyond so many cameras no envelope is looked for: the graph of cameras is a dense matrix.
+_MANY = 10_000
+
+
+class Packed:
+    """The observations in the order of the chunks (bundle.h), and the envelope they give.
+
+    Attributes
+    ----------
+    lanes, rows : ndarray of int
+        Where the lanes and the observations of each chunk begin.
+    order : ndarray of int, shape (n,), or None
+        Numbers of the cameras in the order of the envelope; None where it is their own.
+    """
+
+    def __init__(self, layout: Layout, q: Array, weights: Array) -> None:
+        self._layout, self._q, self._weights = layout, q, weights
+        counts = np.diff(layout.first)
+        points = _together(layout, counts)
+        self.lanes, self.rows = _chunks(counts[points])
+        filling, rows = self.lanes[-1] - len(points), self.rows[-1]
+        self._point = np.concatenate([points, np.full(filling, points[-1])]).astype(np.int32)
+        self._count = np.concatenate([counts[points], np.zeros(filling)]).astype(np.int32)
+        self._observed = np.empty(rows, np.int32), np.empty(2 * rows), np.empty(rows)
+        self.order: Indices | None = None
+        self._envelope: Envelope | None = None
+        self._pack(layout.view, q, weights)
+
+    def bundle(self, loss: Loss) -> Bundle:
+        """Return the C structure."""
+        arrays = (self.lanes, self.rows, self._point, self._count, *self._observed)
+        return Bundle(
+            self._layout.n_views,
+            self._layout.n_points,
+            len(self.lanes) - 1,
+            *map(address, arrays),
+            least=LEAST_WEIGHT * float(np.max(self._weights)),
+            scale2=loss.scale**2,
+            loss=LOSSES.index(loss.name),
+        )
+
+    def shares(self, count: int) -> list[tuple[int, int]]:
+        """Split the chunks into ranges of about equal work, that of the pairs of observations."""
+        slots = np.diff(self.rows) // np.diff(self.lanes)
+        work = np.cumsum(np.diff(self.rows) * (slots + _PASSES))
+        cuts = np.searchsorted(work, work[-1] * np.arange(1, count) / count)
+        edges = [0, *cuts.tolist(), len(slots)]
+        return [(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+
+    def narrowed(self) -> Envelope:
+        """Return the envelope; the cameras get the order that narrows it when first asked."""
+        if self._envelope is None:
+            layout, n = self._layout, self._layout.n_views
+            self._envelope = Envelope.full(n)
+            if n <= _MANY:
+                together = np.zeros((n, n), np.bool_)
+                bundle = self.bundle(Loss())
+                function("bundle_neighbours")(ctypes.byref(bundle), address(together))
+                self._envelope, self.order = narrow(together)
+            if self.order is not None:
+                number = np.argsort(self.order)[layout.view]
+                rows = np.lexsort((number, layout.point))
+                self._pack(number[rows], self._q[:, rows], self._weights[rows])
+        return self._envelope
+
+    def _pack(self, view: Indices, q: Array, weights: Array) -> None:
+        """Copy the observations, sorted by point, then view."""
+        arrays = [np.ascontiguousarray(a) for a in (self._layout.first, view, q, weights)]
+        bundle = self.bundle(Loss())
+        function("bundle_pack")(ctypes.byref(bundle), *map(address, (*arrays, *self._observed)))
+
+
+def _together(layout: Layout, counts: Indices) -> Indices:
+    """Return the points by falling number of observations, those of the same views together."""
+    first, last, view = layout.first[:-1], layout.first[1:] - 1, layout.view
+    return np.lexsort((view[last], view[np.minimum(first + 1, last)], view[first], -counts))
+
+
+def _chunks(counts: Indices) -> tuple[Indices, Indices]:
+    """Return where the lanes and the rows of each chunk begin, for falling counts."""
+    lanes, rows = [0], [0]
+    begin, m = 0, len(counts)
+    while begin < m:
+        slots = int(counts[begin])
+        width = min(max(_ROWS // slots // LANES * LANES, LANES), _MOST_LANES)
+        width = min(width, -(-(m - begin) // LANES) * LANES)
+        lanes.append(lanes[-1] + width)
+        rows.append(rows[-1] + width * slots)
+        begin += width
+    return np.array(lanes), np.array(rows)
