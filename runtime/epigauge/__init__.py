@@ -5,38 +5,41 @@
 >>> result.F, result.rms_px, result.covariance  # doctest: +SKIP
 """
 
-from epigauge import casadi, colmap, datasets, interop, kernels
-from epigauge.errors import ArgumentError, BackendError, EpigaugeError, FileFormatError
-from epigauge.images import ImageMatches, load_image, match_images
-from epigauge.io import (
-    Matches,
-    load_matches,
-    load_reconstruction,
-    load_tracks,
-    save_matches,
-    save_reconstruction,
-    save_result,
-    save_tracks,
-)
-from epigauge.kernels import backend, set_backend
-from epigauge.multi_view import gauge
-from epigauge.multi_view.adjust import BundleResult, bundle_adjust
-from epigauge.multi_view.compare import Comparison, compare
-from epigauge.multi_view.initialize import initialize
-from epigauge.multi_view.tracks import Reconstruction, Tracks
-from epigauge.multi_view.uncertainty import ReconstructionCovariance, covariance
-from epigauge.scenes import MultiViewScene, TwoViewScene, multi_view_scene, two_view_scene
-from epigauge.two_view.batch import BATCH_STATUS, FundamentalBatch, refine_fundamental_batch
-from epigauge.two_view.geometry import (
-    canonical_cameras,
-    reprojection_distances,
-    sampson_distances,
-    triangulate,
-)
-from epigauge.two_view.initial import fundamental_7point, fundamental_8point
-from epigauge.two_view.refine import refine_fundamental
-from epigauge.two_view.result import FundamentalResult
-from epigauge.two_view.robust import RobustResult, estimate_fundamental
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
+    from epigauge import casadi, colmap, datasets, interop, kernels
+    from epigauge.errors import ArgumentError, BackendError, EpigaugeError, FileFormatError
+    from epigauge.images import ImageMatches, load_image, match_images
+    from epigauge.io import (
+        Matches,
+        load_matches,
+        load_reconstruction,
+        load_tracks,
+        save_matches,
+        save_reconstruction,
+        save_result,
+        save_tracks,
+    )
+    from epigauge.kernels import backend, set_backend
+    from epigauge.multi_view import gauge
+    from epigauge.multi_view.adjust import BundleResult, bundle_adjust
+    from epigauge.multi_view.compare import Comparison, compare
+    from epigauge.multi_view.initialize import initialize
+    from epigauge.multi_view.tracks import Reconstruction, Tracks
+    from epigauge.multi_view.uncertainty import ReconstructionCovariance, covariance
+    from epigauge.scenes import MultiViewScene, TwoViewScene, multi_view_scene, two_view_scene
+    from epigauge.two_view.batch import BATCH_STATUS, FundamentalBatch, refine_fundamental_batch
+    from epigauge.two_view.geometry import (
+        canonical_cameras,
+        reprojection_distances,
+        sampson_distances,
+        triangulate,
+    )
+    from epigauge.two_view.initial import fundamental_7point, fundamental_8point
+    from epigauge.two_view.refine import refine_fundamental
+    from epigauge.two_view.result import FundamentalResult
+    from epigauge.two_view.robust import RobustResult, estimate_fundamental
 
 __version__ = "0.1.0"
 
@@ -91,3 +94,51 @@ __all__ = [
     "triangulate",
     "two_view_scene",
 ]
+
+#: Modules below this package, and the public names that they define.
+_WHERE = {
+    "errors": "ArgumentError BackendError EpigaugeError FileFormatError",
+    "images": "ImageMatches load_image match_images",
+    "io": (
+        "Matches load_matches load_reconstruction load_tracks "
+        "save_matches save_reconstruction save_result save_tracks"
+    ),
+    "kernels": "backend set_backend",
+    "multi_view.adjust": "BundleResult bundle_adjust",
+    "multi_view.compare": "Comparison compare",
+    "multi_view.initialize": "initialize",
+    "multi_view.tracks": "Reconstruction Tracks",
+    "multi_view.uncertainty": "ReconstructionCovariance covariance",
+    "scenes": "MultiViewScene TwoViewScene multi_view_scene two_view_scene",
+    "two_view.batch": "BATCH_STATUS FundamentalBatch refine_fundamental_batch",
+    "two_view.geometry": ("canonical_cameras reprojection_distances sampson_distances triangulate"),
+    "two_view.initial": "fundamental_7point fundamental_8point",
+    "two_view.refine": "refine_fundamental",
+    "two_view.result": "FundamentalResult",
+    "two_view.robust": "RobustResult estimate_fundamental",
+}
+_MODULES = {
+    **{name: name for name in ("casadi", "colmap", "datasets", "interop", "kernels")},
+    **{name: name for name in ("errors", "images", "io", "lm", "plots", "reports", "scenes")},
+    "gauge": "multi_view.gauge",
+}
+_HOME = {name: module for module, names in _WHERE.items() for name in names.split()}
+
+if not TYPE_CHECKING:  # a checker takes a module with __getattr__ to have every name
+
+    def __getattr__(name: str) -> object:
+        """Import what a public name stands for, when it is first asked for (PEP 562)."""
+        from importlib import import_module
+
+        if name in _MODULES:
+            value = import_module(f"{__name__}.{_MODULES[name]}")
+        elif name in _HOME:
+            value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+        else:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name)
+        globals()[name] = value
+        return value
+
+    def __dir__() -> list[str]:
+        """List the public names, whether imported yet or not."""
+        return sorted({*globals(), *__all__})

@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from typer import Typer
 
 _NEEDED = ("typer", "rich")
 
 
 def main() -> None:
     """Run the command line; exit with 2 and the remedy where its packages are not installed."""
+    try:
+        _app()(prog_name="epigauge")
+    except KeyboardInterrupt:  # while modules are imported; later, commands see to it
+        print("epigauge: interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+def _app() -> Typer:
+    """Import the commands."""
     try:
         from epigauge.cli import app
     except ModuleNotFoundError as error:
@@ -20,7 +33,7 @@ def main() -> None:
             file=sys.stderr,
         )
         sys.exit(2)
-    app(prog_name="epigauge")
+    return app
 
 
 if __name__ == "__main__":

@@ -17,6 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from epigauge.errors import ArgumentError
 
 __all__ = [
+    "MAX_PX",
+    "MAX_WEIGHT",
+    "MIN_PX",
     "as_calibration",
     "as_choice",
     "as_count",
@@ -32,6 +35,16 @@ __all__ = [
 Array = NDArray[np.float64]
 
 _POINTS = "an (m, 2) array of pixel coordinates"
+
+#: Pixel coordinates are accepted up to MAX_PX, and sets of them whose largest is zero or at least
+#: MIN_PX: fourth powers of others overflow or vanish.
+MIN_PX, MAX_PX = 1e-70, 1e70
+
+#: Largest weight accepted.
+MAX_WEIGHT = 1e100
+
+#: Binary exponent from which a matrix of free scale is rescaled, which is exact.
+_EXPONENT = 200
 
 #: A point set is collinear when its thickness is below this fraction of its length. Image points
 #: are never measured to 1e-7 of an image, and text files round there.
@@ -64,9 +77,9 @@ def as_matches(
     Raises
     ------
     ArgumentError
-        On another shape, unequal lengths, NaN or infinity (the first such row is named), a type
-        that is not a real number, fewer than `at_least` matches and, with `general_position`,
-        points without extent in two dimensions.
+        On another shape, unequal lengths, NaN, infinity or coordinates beyond 1e70 (the first such
+        row is named), none beyond 1e-70, a type that is not a real number, fewer than `at_least`
+        matches and, with `general_position`, points without extent in two dimensions.
     """
     a1, a2 = _points("x1", x1), _points("x2", x2)
     if len(a1) != len(a2):
@@ -175,7 +188,8 @@ def as_fundamental(F0: ArrayLike, name: str = "F0") -> Array:
     Returns
     -------
     ndarray, shape (3, 3), float64
-        A matrix that may share memory with the input: do not write into it.
+        A matrix that may share memory with the input: do not write into it. One whose largest
+        entry is not between 2^-200 and 2^200 is rescaled, so that products do not overflow.
 
     Raises
     ------
@@ -190,7 +204,7 @@ def as_fundamental(F0: ArrayLike, name: str = "F0") -> Array:
         raise ArgumentError(name, f"has {F[row, column]} at [{row}, {column}]", "finite entries")
     if not F.any():
         raise ArgumentError(name, "is the zero matrix", "a matrix of rank 2")
-    return F
+    return rescaled(F)
 
 
 def as_calibration(name: str, K: ArrayLike) -> Array:
@@ -308,15 +322,16 @@ def as_weights(weights: ArrayLike, m: int) -> Array:
     Raises
     ------
     ArgumentError
-        On another shape or type, a negative, infinite or NaN weight (the first is named), or
-        weights that are all zero.
+        On another shape or type, a negative or NaN weight or one beyond 1e100 (the first is named),
+        or weights that are all zero.
     """
     w = as_real("weights", weights, f"an ({m},) array")
     if w.shape != (m,):
         raise ArgumentError("weights", f"has shape {w.shape}", f"({m},): one weight a match")
-    bad = np.flatnonzero(~(np.isfinite(w) & (w >= 0.0)))
+    bad = np.flatnonzero(~((w >= 0.0) & (w <= MAX_WEIGHT)))
     if len(bad):
-        raise ArgumentError("weights", f"has {w[bad[0]]} in row {bad[0]}", "finite numbers >= 0")
+        needed = f"finite numbers >= 0, at most {MAX_WEIGHT:g}"
+        raise ArgumentError("weights", f"has {w[bad[0]]} in row {bad[0]}", needed)
     if m and not w.any():
         raise ArgumentError("weights", "is zero for every match", "some positive weights")
     return w
@@ -369,13 +384,15 @@ def _points(name: str, value: ArrayLike) -> Array:
         points = points[:, 0, :]
     if points.ndim != 2 or points.shape[1] != 2:
         raise ArgumentError(name, f"has shape {points.shape}", _POINTS + _hint(points.shape))
-    finite = np.isfinite(points)
-    if not finite.all():
-        row = int(np.flatnonzero(~finite.all(axis=1))[0])
+    size = np.abs(points)
+    good = size <= MAX_PX  # false for NaN
+    if not good.all():
+        row = int(np.flatnonzero(~good.all(axis=1))[0])
         x, y = points[row]
-        raise ArgumentError(
-            name, f"has a point ({x}, {y}) in row {row}", "finite coordinates: drop such matches"
-        )
+        needed = f"finite coordinates below {MAX_PX:g}: drop such matches"
+        raise ArgumentError(name, f"has a point ({x}, {y}) in row {row}", needed)
+    if 0.0 < size.max(initial=0.0) < MIN_PX:
+        raise ArgumentError(name, f"has no coordinate beyond {MIN_PX:g}", "another unit of length")
     return np.ascontiguousarray(points)
 
 
@@ -399,18 +416,34 @@ def _is_spread(points: Array, eps: float) -> bool:
     )
 
 
-def as_real(name: str, value: ArrayLike, needed: str) -> Array:
-    """Convert to float64, refusing every type that is not a real number."""
+def as_array(name: str, value: ArrayLike, needed: str) -> NDArray[Any]:
+    """Convert to an array of whatever type, refusing ragged lists and masked entries."""
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         raise ArgumentError(name, "is a masked array", f"{needed} without masked entries")
     try:
-        array = np.asarray(value)
+        return np.asarray(value)
     except (ValueError, TypeError) as error:
         raise ArgumentError(name, "is not a regular array", f"{needed} ({error})") from None
+
+
+def as_real(name: str, value: ArrayLike, needed: str) -> Array:
+    """Convert to float64, refusing every type that is not a real number."""
+    array = as_array(name, value, needed)
     if array.dtype.kind not in "iuf":
         raise ArgumentError(name, f"has type {array.dtype}", f"{needed} of real numbers")
-    with np.errstate(over="ignore"):  # a long double beyond float64 becomes inf: refused later
+    return as_double(array)
+
+
+def as_double(array: NDArray[Any]) -> Array:
+    """Convert to float64; a long double beyond its range becomes infinite, to be refused later."""
+    with np.errstate(over="ignore"):
         return array.astype(np.float64, copy=False)
+
+
+def rescaled(array: Array) -> Array:
+    """Return an array of free scale, times a power of two if its products could overflow."""
+    exponent = int(np.frexp(np.abs(array).max())[1])
+    return array if abs(exponent) < _EXPONENT else np.ldexp(array, -exponent)
 
 
 def _resolution(value: Any) -> float:

@@ -23,7 +23,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epigauge._arguments import as_calibration, as_choice, as_fundamental, as_matches, as_real
+from epigauge._arguments import (
+    as_array,
+    as_calibration,
+    as_choice,
+    as_fundamental,
+    as_matches,
+    as_real,
+)
 from epigauge.errors import ArgumentError, MissingPackageError
 from epigauge.two_view.free import fundamental_from_cameras
 
@@ -67,6 +74,8 @@ def move_points(x: ArrayLike, source: str, target: str) -> Array:
     points = as_real("x", x, "an (m, 2) array")
     if not points.ndim or points.shape[-1] != 2:
         raise ArgumentError("x", f"has shape {points.shape}", "an (m, 2) array")
+    if not np.isfinite(points).all():
+        raise ArgumentError("x", "is not finite", "finite coordinates")
     return points + _shift(source, target)
 
 
@@ -168,11 +177,11 @@ def from_colmap(keypoints1: Any, keypoints2: Any, matches: Any) -> tuple[Array, 
     ArgumentError
         If a match has no such keypoint, or the shapes are others.
     """
-    if len(matches) and hasattr(matches[0], "point2D_idx1"):
+    if hasattr(_first(matches), "point2D_idx1"):
         matches = [(match.point2D_idx1, match.point2D_idx2) for match in matches]
     sets = []
     for name, points in (("keypoints1", keypoints1), ("keypoints2", keypoints2)):
-        if len(points) and hasattr(points[0], "x"):
+        if hasattr(_first(points), "x"):
             points = [(point.x, point.y) for point in points]
         table = as_real(name, points, "an (n, 2), (n, 4) or (n, 6) array")
         if table.size and (table.ndim != 2 or table.shape[1] not in (2, 4, 6)):
@@ -339,9 +348,17 @@ def _shift(source: str, target: str) -> float:
     return _MIDDLE[target] - _MIDDLE[source]
 
 
+def _first(sequence: Any) -> Any:
+    """Return the first item; None where there is none, or no sequence."""
+    try:
+        return sequence[0] if len(sequence) else None
+    except (TypeError, LookupError):
+        return None
+
+
 def _picked(points1: Array, points2: Array, matches: ArrayLike) -> tuple[Array, Array]:
     """Return the points that matches, pairs of their numbers, join."""
-    indices = np.asarray(matches)
+    indices = as_array("matches", matches, "pairs of keypoint numbers, (m, 2) integers")
     if not indices.size:
         return np.zeros((0, 2)), np.zeros((0, 2))
     if indices.ndim != 2 or indices.shape[1] != 2 or indices.dtype.kind not in "iu":

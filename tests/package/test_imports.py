@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ast
+import contextlib
+import importlib
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import epigauge
 import pytest
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -15,6 +18,10 @@ OPTIONAL = {
     *("casadi", "cv2", "matplotlib", "pooch", "requests", "rich", "scipy", "sympy", "typer"),
     "epigauge_derive",
 }
+#: Parts of the standard library that take long to import, or that a Python may come without.
+COSTLY = {"asyncio", "email", "http", "multiprocessing", "sqlite3", "ssl", "unittest", "xml"}
+#: Seconds of processor time that `import epigauge` may take beyond NumPy's.
+LIMIT_S = 0.2
 
 
 def imported(tree: ast.AST, *, inside_functions: bool = True) -> Iterator[str]:
@@ -38,12 +45,67 @@ def imports_below(folder: str, **options: bool) -> dict[str, set[str]]:
     }
 
 
-def test_importing_epigauge_imports_no_optional_package() -> None:
-    code = "import sys, epigauge; print(*{name.split('.')[0] for name in sys.modules})"
+def printed(code: str) -> list[str]:
+    """Run code in a new interpreter; return the words that it prints."""
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    loaded = set(run.stdout.split())
-    assert "numpy" in loaded
-    assert not loaded & OPTIONAL
+    return run.stdout.split()
+
+
+@pytest.mark.parametrize("used", ["", "[getattr(epigauge, name) for name in epigauge.__all__]"])
+def test_importing_epigauge_imports_nothing_optional_or_costly(used: str) -> None:
+    code = f"import sys, numpy; before = set(sys.modules); import epigauge; {used}\n"
+    loaded = printed(code + "print(*{name.split('.')[0] for name in set(sys.modules) - before})")
+    assert "epigauge" in loaded
+    assert not set(loaded) & (OPTIONAL | COSTLY)
+
+
+@pytest.mark.parametrize("used", ["", "epigauge.refine_fundamental; epigauge.bundle_adjust"])
+def test_importing_epigauge_is_quick(used: str) -> None:
+    code = f"""
+import time, numpy
+begin = time.process_time()
+import epigauge
+{used}
+print(time.process_time() - begin)
+"""
+    assert min(float(printed(code)[0]) for _ in range(3)) < LIMIT_S
+
+
+def test_public_names_are_imported_from_where_the_checker_finds_them() -> None:
+    """What `epigauge.__getattr__` does is what the imports for type checkers say."""
+    tree = ast.parse(Path(epigauge.__file__).read_text())
+    found = {
+        alias.name: (node.module, alias.name)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module.startswith("epigauge")
+        for alias in node.names
+    }
+    assert set(found) == set(epigauge.__all__)
+    for name, (module, _) in found.items():
+        home = importlib.import_module(module)
+        with contextlib.suppress(ModuleNotFoundError):
+            importlib.import_module(f"{module}.{name}")
+        assert getattr(epigauge, name) is getattr(home, name)
+    assert set(epigauge.__all__) <= set(dir(epigauge))
+    with pytest.raises(AttributeError, match="no attribute 'refine'"):
+        epigauge.refine  # noqa: B018
+
+
+def test_threads_that_ask_first_get_the_same_names() -> None:
+    code = """
+import threading, epigauge
+barrier = threading.Barrier(8)
+found = [None] * 8
+def ask(k):
+    barrier.wait()
+    names = epigauge.__all__[5 * k:] + epigauge.__all__[:5 * k]
+    found[k] = {name: getattr(epigauge, name) for name in names}
+threads = [threading.Thread(target=ask, args=(k,)) for k in range(8)]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+print(all(one == found[0] and len(one) == len(epigauge.__all__) for one in found))
+"""
+    assert printed(code) == ["True"]
 
 
 @pytest.mark.parametrize(

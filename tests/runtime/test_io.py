@@ -59,7 +59,7 @@ def zipped(path: Path, **members: bytes) -> Path:
 @pytest.mark.parametrize("suffix", [".csv", ".txt", ".npz"])
 @pytest.mark.parametrize("weights", [None, np.linspace(0, 1 / 3, 9)])
 def test_matches_come_back_to_the_last_bit(tmp_path, suffix, weights) -> None:
-    saved = Matches(X1 * [1e-300, 1e300], X2 / 3, weights, (640, 480), (800, 600))
+    saved = Matches(X1 * [1e-300, 1e60], X2 / 3, weights, (640, 480), (800, 600))
     save_matches(tmp_path / f"a pair{suffix}", saved)
     loaded = load_matches(tmp_path / f"a pair{suffix}")
     assert len(loaded) == 9
