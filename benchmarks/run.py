@@ -11,6 +11,9 @@ SCRIPTS = {
     "evaluations.py": ["--trials", "5"],
     "bias.py": ["--trials", "50"],
     "robust.py": ["--trials", "3"],
+    "two_views.py": ["--quick"],
+    "kernels.py": ["--quick"],
+    "imports.py": ["--runs", "3"],
 }
 
 

@@ -96,14 +96,14 @@ int eg_bundle_linearize(
                             own + 24 * M);
             eg_add(25 * M, own, sums);
             eg_camera_normal(M, seen_by, points, q, w, factors, factors + 6 * M, factors + 7 * M);
-            for (ptrdiff_t j = 0, end; j < filled; j = end) {
-                end = eg_run(view, j, filled);
+            for (ptrdiff_t j = 0, next; j < filled; j = next) {
+                next = eg_run(view, j, filled);
                 const double *moment = moments + 16 * j, *factor = factors + j;
                 double *sum = cameras + EG_CAMERA * view[j], *low = sum + 7 * 8;
-                eg_accumulate(end - j, factor, M, moment, sum, low);
-                eg_accumulate(end - j, factor + 3 * M, M, moment, sum + 3 * 8, low + 3 * 4);
-                eg_accumulate_one(end - j, factor + 6 * M, moment, sum + 6 * 8, low + 6 * 4);
-                eg_accumulate_points(end - j, factor + 7 * M, M, moment, sum + 7 * EG_MOMENTS);
+                eg_accumulate(next - j, factor, M, moment, sum, low);
+                eg_accumulate(next - j, factor + 3 * M, M, moment, sum + 3 * 8, low + 3 * 4);
+                eg_accumulate_one(next - j, factor + 6 * M, moment, sum + 6 * 8, low + 6 * 4);
+                eg_accumulate_points(next - j, factor + 7 * M, M, moment, sum + 7 * EG_MOMENTS);
             }
         }
         unpack_symmetric(&chunk, sums, V);

@@ -245,4 +245,9 @@ static inline ptrdiff_t eg_run(const int32_t *view, ptrdiff_t begin, ptrdiff_t f
     return end;
 }
 
+/* In bundle_pairs.c. */
+void eg_add_to_pairs(const eg_chunk *chunk, const eg_envelope *envelope, const double *Y,
+                     const double *moments, double *X, double *turned, ptrdiff_t *views,
+                     int32_t *sorted, double *pairs);
+
 #endif

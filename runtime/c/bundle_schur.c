@@ -78,31 +78,6 @@ static void add_to_cameras(const eg_chunk *chunk, ptrdiff_t filled, const int32_
     }
 }
 
-/* Where the sums of a pair of views are, or NULL where they are outside the envelope. */
-static inline double *pair_of(const eg_envelope *envelope, int32_t row, int32_t column, double *pairs)
-{
-    const int32_t first = envelope->first[row];
-    return column < first ? 0 : pairs + EG_PAIR * (envelope->slot[row] + column - first);
-}
-
-/* Add the factors X (nine, M apart) times moments of each lane to the pair of its two views.
-   Neighbouring lanes with the same two views share the loads and stores of their pair. */
-static void add_to_pairs(const eg_chunk *chunk, const eg_envelope *envelope, ptrdiff_t filled,
-                         const int32_t *EG_RESTRICT rows, const int32_t *EG_RESTRICT columns,
-                         const double *EG_RESTRICT X, const double *EG_RESTRICT moments,
-                         double *pairs)
-{
-    for (ptrdiff_t begin = 0, end; begin < filled; begin = end) {
-        for (end = begin + 1; end < filled; ++end)
-            if (rows[end] != rows[begin] || columns[end] != columns[begin])
-                break;
-        double *sum = pair_of(envelope, rows[begin], columns[begin], pairs);
-        for (int e = 0; sum && e < 9; e += 3)
-            eg_accumulate(end - begin, X + begin + e * chunk->M, chunk->M, moments + 16 * begin,
-                          sum + 8 * e, sum + 9 * 8 + 4 * e);
-    }
-}
-
 /* Y of all slots of a chunk: w a^T a P T. `scratch` has 12 + 5 M entries. */
 static void couplings(const eg_bundle *bundle, const eg_chunk *chunk, const double *P,
                       const double *points, const double *roots, double *scratch, double *Y)
@@ -127,15 +102,21 @@ int eg_bundle_schur(
     const double *T, const double *half, const eg_envelope *envelope, double *pairs,
     double *cameras)
 {
-    double *scratch = eg_scratch(bundle, begin, end, 4 + 4 + 16 + 16 + 17 + 9, 12);
-    if (!scratch)
+    double *scratch = eg_scratch(bundle, begin, end, 4 + 4 + 16 + 16 + 17 + 9, 25);
+    ptrdiff_t *views = malloc(((size_t)bundle->n_views + 1) * sizeof *views);
+    if (!scratch || !views) {
+        if (scratch)
+            eg_release(scratch);
+        free(views);
         return 1;
+    }
     for (ptrdiff_t c = begin; c < end; ++c) {
         const eg_chunk chunk = eg_chunk_of(bundle, c);
         const ptrdiff_t M = chunk.M;
         double *points = scratch, *v = points + 4 * M, *moments = v + 4 * M;
         double *roots = moments + 16 * M, *work = roots + 16 * M, *X = work + 17 * M;
-        double *Y = X + 9 * M;
+        double *Y = X + 9 * M, *turned = Y + 12 * M * chunk.L;
+        int32_t *sorted = (int32_t *)(turned + 12 * M * chunk.L);
         eg_gather(M, 4, Q, chunk.point, points);
         gather_roots(&chunk, T, roots);
         eg_moments(M, points, moments);
@@ -143,28 +124,14 @@ int eg_bundle_schur(
         ptrdiff_t filled = M;
         if (half)
             eg_gather(M, 4, half, chunk.point, v);
-        for (ptrdiff_t t = 0; t < chunk.L; ++t) {
-            const double *Yt = Y + 12 * t * M;
-            filled = eg_filled(&chunk, t, filled);
-            if (half)
-                add_to_cameras(&chunk, filled, chunk.view + t * M, Yt, moments, v, X, cameras);
-            for (ptrdiff_t s = 0; s <= t; ++s) {
-                const double *Ys = Y + 12 * s * M;
-                for (int a = 0; a < 3; ++a)
-                    for (int b = 0; b < 3; ++b) {
-                        EG_SIMD
-                        for (ptrdiff_t j = 0; j < M; ++j)
-                            X[(3 * a + b) * M + j] =
-                                Ys[(4 * a) * M + j] * Yt[(4 * b) * M + j]
-                                + Ys[(4 * a + 1) * M + j] * Yt[(4 * b + 1) * M + j]
-                                + Ys[(4 * a + 2) * M + j] * Yt[(4 * b + 2) * M + j]
-                                + Ys[(4 * a + 3) * M + j] * Yt[(4 * b + 3) * M + j];
-                    }
-                add_to_pairs(&chunk, envelope, filled, chunk.view + t * M, chunk.view + s * M, X,
-                             moments, pairs);
-            }
+        for (ptrdiff_t s = 0; half && s < chunk.L; ++s) {
+            filled = eg_filled(&chunk, s, filled);
+            add_to_cameras(&chunk, filled, chunk.view + s * M, Y + 12 * s * M, moments, v, X,
+                           cameras);
         }
+        eg_add_to_pairs(&chunk, envelope, Y, moments, X, turned, views, sorted, pairs);
     }
+    free(views);
     eg_release(scratch);
     return 0;
 }

@@ -435,9 +435,12 @@ def as_real(name: str, value: ArrayLike, needed: str) -> Array:
 
 
 def as_double(array: NDArray[Any]) -> Array:
-    """Convert to float64; a long double beyond its range becomes infinite, to be refused later."""
+    """Convert to float64, at addresses where C may read it.
+
+    A long double beyond its range becomes infinite, to be refused later.
+    """
     with np.errstate(over="ignore"):
-        return array.astype(np.float64, copy=False)
+        return array.astype(np.float64, copy=not array.flags.aligned)
 
 
 def rescaled(array: Array) -> Array:

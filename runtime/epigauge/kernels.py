@@ -206,13 +206,13 @@ def _wrap_c(name: str, signature: Signature) -> Kernel:
 
 
 def _whole(array: Array, argument: Argument, batch: tuple[int, ...]) -> Array:
-    """Return a contiguous array with all its batch axes."""
+    """Return a contiguous array with all its batch axes, aligned as C needs it."""
     shape = argument.shape + batch if argument.batched else argument.shape
     if array.shape != shape:
         missing = len(batch) - (array.ndim - len(argument.shape))
         own = array.shape[len(argument.shape) :]
         array = np.broadcast_to(array.reshape(argument.shape + (1,) * missing + own), shape)
-    return np.ascontiguousarray(array)
+    return np.ascontiguousarray(array if array.flags.aligned else array.copy())
 
 
 def _wrap_casadi(name: str, signature: Signature) -> Kernel:

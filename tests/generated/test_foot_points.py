@@ -384,6 +384,17 @@ def test_fast_foot_point_that_settled_is_the_safe_one(table, name):
 
 
 @pytest.mark.parametrize("name", MATRICES)
+def test_fast_foot_point_beyond_half_way_to_the_poles_does_not_count_as_settled(table, name):
+    # Near the poles +-1 / s1 the fast form cancels: a tiny last change there proves nothing.
+    F = MATRICES[name]
+    frame = table.bilinear_frame(F)
+    with np.errstate(all="ignore"):  # Newton may step onto a pole
+        multiplier, change, _ = table.foot_point(*frame, *noisy(16, F, 4000))
+        beyond = ~(frame[2][0] * np.abs(multiplier) < 0.5)
+    np.testing.assert_array_equal(change[beyond], multiplier[beyond])
+
+
+@pytest.mark.parametrize("name", MATRICES)
 def test_safe_foot_point_has_converged_to_rounding(table, name):
     F = MATRICES[name]
     frame = table.bilinear_frame(F)

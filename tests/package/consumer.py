@@ -49,7 +49,7 @@ def main() -> None:
     # A name that there is not, and an option of the wrong type, are errors to a checker.
     assert not hasattr(eg, "refine")
     if not scene:
-        eg.refine  # type: ignore[attr-defined]
+        eg.refine(scene)  # type: ignore[attr-defined]
         eg.refine_fundamental(scene.x1, scene.x2, max_iter="many")  # type: ignore[arg-type]
 
 

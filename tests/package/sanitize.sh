@@ -11,7 +11,8 @@ python=${PYTHON:-python3}
 cc=${CC:-gcc}
 
 folder=$(mktemp -d)
-trap 'rm -rf "$folder"' EXIT
+# Reports go to files: pytest would keep to itself what a test that ends the process has written.
+trap 'cat "$folder"/report.* 2>/dev/null; rm -rf "$folder"' EXIT
 cp -r "$checkout/generated" "$checkout/runtime" "$checkout/tests" "$checkout/pyproject.toml" "$folder"
 find "$folder" -name '*.so' -delete
 
@@ -27,11 +28,12 @@ done | xargs -P "$(nproc)" -I{} sh -c \
 $cc -shared -fsanitize=address,undefined ./*.o -lm \
     -o generated/epigauge_generated/c_backend/libepigauge_kernels.so
 
+# The C++ library, too, since those that Python loads later (OpenCV) throw exceptions.
 export LD_PRELOAD
-LD_PRELOAD=$($cc -print-file-name=libasan.so)
+LD_PRELOAD="$($cc -print-file-name=libasan.so) $($cc -print-file-name=libstdc++.so)"
 # Python itself leaves memory to the system at exit, which is no leak of the library's.
-export ASAN_OPTIONS=detect_leaks=0:strict_string_checks=1
-export UBSAN_OPTIONS=print_stacktrace=1
+export ASAN_OPTIONS=detect_leaks=0:log_path=$folder/report
+export UBSAN_OPTIONS=print_stacktrace=1:log_path=$folder/report
 # Python's and NumPy's own pools would hide what lies beside an array.
 export PYTHONMALLOC=malloc
 export OPENBLAS_NUM_THREADS=1

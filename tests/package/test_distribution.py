@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import subprocess
 import sys
 import tarfile
@@ -16,6 +17,8 @@ import pytest
 pytestmark = pytest.mark.slow
 
 CHECKOUT = Path(__file__).resolve().parents[2]
+#: What manylinux2014 promises: any Linux since 2014 can load the libraries.
+GLIBC = (2, 17)
 PACKAGES = {"epigauge", "epigauge_generated", "epigauge_derive"}
 LIBRARIES = {
     f"libepigauge_kernels{level}{suffix}"
@@ -51,6 +54,17 @@ def unpacked(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         archive.extractall(target, filter="data")
     (folder,) = target.iterdir()
     return folder
+
+
+def newest_glibc(wheel: Path) -> tuple[int, int]:
+    """Return the newest version of glibc that a library in a wheel asks for."""
+    with zipfile.ZipFile(wheel) as archive:
+        found = [
+            re.findall(rb"\bGLIBC_(\d+)\.(\d+)", archive.read(name))
+            for name in archive.namelist()
+            if name.endswith(".so")
+        ]
+    return max(((int(a), int(b)) for versions in found for a, b in versions), default=(0, 0))
 
 
 def sources(folder: str) -> set[str]:
@@ -102,8 +116,9 @@ def test_wheel_from_sdist_holds_the_packages_and_the_libraries(
         assert any(Path(name).stem == "libepigauge_kernels" for name in libraries)
         if platform.machine() in ("x86_64", "AMD64") and os.name == "posix":
             assert len(libraries) == 3
-        assert wheel.name.startswith("epigauge-0.1.0-py3-none-")
+        assert wheel.name.startswith(f"epigauge-{epigauge.__version__}-py3-none-")
         assert not wheel.name.endswith("-any.whl")
+        assert newest_glibc(wheel) <= GLIBC
 
 
 @pytest.mark.parametrize(

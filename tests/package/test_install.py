@@ -32,6 +32,13 @@ def test_absent_library_is_an_error_with_a_remedy() -> None:
         epigauge.set_backend("c")
 
 
+def test_program_of_a_user_runs() -> None:
+    """What `tox -e types` checks the types of."""
+    program = Path(__file__).with_name("consumer.py")
+    run = subprocess.run([sys.executable, program], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+
+
 def run_without(package: str, *command: str) -> subprocess.CompletedProcess[str]:
     """Run the command line with arguments `command` where `package` cannot be imported."""
     code = (

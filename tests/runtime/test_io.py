@@ -344,7 +344,10 @@ def test_absent_file_is_an_oserror(tmp_path) -> None:
 # Whatever the bytes: matches or a FileFormatError
 
 fuzzing = settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=150,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 
 
@@ -393,9 +396,15 @@ def mutated(draw: st.DrawFn, good: bytes) -> bytes:
 
 
 @fuzzing
-@given(mutated(GOOD_TEXT) | st.binary(max_size=300) | st.text(max_size=200).map(str.encode))
+@given(
+    mutated(GOOD_TEXT)
+    | mutated(GOOD_TEXT.replace(b",", b" "))
+    | st.binary(max_size=300)
+    | st.text(max_size=200).map(str.encode)
+)
 def test_any_text_gives_matches_or_a_file_format_error(tmp_path, content) -> None:
     read_hostile(tmp_path / "fuzz.csv", content)
+    read_hostile(tmp_path / "fuzz.txt", content)
 
 
 @fuzzing

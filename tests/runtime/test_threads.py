@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import epigauge as eg
@@ -25,18 +26,17 @@ BACKENDS = [name for name, reason in kernels.available().items() if reason is No
 
 def jobs(backend: str) -> list[Callable[[], Any]]:
     """Return calls of every kind; none depends on another."""
-    refined: list[Callable[[], Any]] = [
-        lambda pair=pair, options=options: eg.refine_fundamental(
-            pair.x1, pair.x2, backend=backend, **options
-        )
-        for pair in PAIRS
-        for options in ({}, {"loss": "huber"}, {"structure": "joint", "max_iter": 3})
-    ]
-    return refined + [
-        lambda: eg.refine_fundamental_batch(X1, X2, OFFSETS, workers=3, backend=backend),
-        lambda: eg.bundle_adjust(MANY.tracks, method="covariant", max_iter=4, backend=backend),
-        lambda: eg.bundle_adjust(MANY.tracks, method="free", max_iter=4, backend=backend),
-        lambda: eg.reprojection_distances(PAIRS[0].F_true, PAIRS[0].x1, PAIRS[0].x2),
+    variants = ({}, {"loss": "huber"}, {"structure": "joint", "max_iter": 3})
+    adjust = partial(eg.bundle_adjust, MANY.tracks, max_iter=4, backend=backend)
+    return [
+        *(
+            partial(eg.refine_fundamental, pair.x1, pair.x2, backend=backend, **options)
+            for pair in PAIRS
+            for options in variants
+        ),
+        partial(eg.refine_fundamental_batch, X1, X2, OFFSETS, workers=3, backend=backend),
+        *(partial(adjust, method=method) for method in ("covariant", "free")),
+        partial(eg.reprojection_distances, PAIRS[0].F_true, PAIRS[0].x1, PAIRS[0].x2),
     ]
 
 

@@ -104,11 +104,12 @@ def write_bal(file: IO[bytes], tracks: Tracks, reconstruction: Reconstruction) -
         file.write(f"{value!r}\n".encode())
 
 
-def _numbers(path: Path, file: IO[bytes]) -> tuple[Array, list[int], list[int], list[int]]:
+def _numbers(
+    path: Path, file: IO[bytes]
+) -> tuple[Array, array.array[int], array.array[int], list[int]]:
     """Read all numbers; for each line the count before it and its number; and the first line."""
     values = array.array("d")
-    first_of_line: list[int] = []
-    line_of: list[int] = []
+    first_of_line, line_of = array.array("q"), array.array("q")
     counts: list[int] = []
     expected = 0
     for line, text, _ in text_lines(path, file):

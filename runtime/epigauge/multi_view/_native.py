@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from functools import cache
 from typing import Any
 
@@ -106,7 +107,7 @@ def checked(status: int) -> None:
 
 def aligned_zeros(shape: tuple[int, ...]) -> Array:
     """Return zeros that begin at a cache line."""
-    size = int(np.prod(shape))
+    size = math.prod(shape)
     whole = np.zeros(size + 8)
     begin = -int(address(whole) or 0) // 8 % 8
     return whole[begin : begin + size].reshape(shape)

@@ -23,6 +23,7 @@ __all__ = [
     "Normal",
     "Reference",
     "Triangulation",
+    "normal_equations",
 ]
 
 Array = NDArray[np.float64]
@@ -65,6 +66,36 @@ class Normal(NamedTuple):
     g_cameras: Array
     g_points: Array
     depth_blocks: tuple[Array, Array] | None = None
+
+
+def normal_equations(layout: Layout, A: Array, B: Array, r: Array) -> Normal:
+    """Return the normal equations of Jacobians by camera and point, and of residuals.
+
+    Parameters
+    ----------
+    layout : Layout
+        Which observation belongs to what.
+    A, B, r : ndarray, shape (k, a, N), (k, b, N), (k, N)
+        Weighted, k residuals an observation.
+    """
+    by_view = np.ascontiguousarray(A[:, :, layout.by_view])
+    size = A.shape[1]
+    U = np.empty((layout.n_views, size, size))
+    for i in range(layout.n_views):
+        rows = slice(layout.first_in_view[i], layout.first_in_view[i + 1])
+        J = by_view[:, :, rows].transpose(1, 0, 2).reshape(size, -1)
+        U[i] = J @ J.T
+    J_camera, J_point = A.transpose(2, 0, 1), B.transpose(2, 0, 1)
+    J_camera_T = np.swapaxes(J_camera, 1, 2)
+    J_point_T = np.swapaxes(J_point, 1, 2)
+    residual = r.T[..., None]
+    return Normal(
+        U=U,
+        V=layout.sum_points(J_point_T @ J_point),
+        coupling=StoredCoupling(layout, J_camera_T @ J_point),
+        g_cameras=layout.sum_views((J_camera_T @ residual)[..., 0]),
+        g_points=layout.sum_points((J_point_T @ residual)[..., 0]),
+    )
 
 
 class Engine(Protocol):
@@ -137,27 +168,7 @@ class Reference:
             # A start with a point in a focal plane has no finite blocks; its cost stops the run.
             r, J_P, J_Q = self._project(P, Q)
             root = self.roots(r)
-            return self._normal(-root * J_P, -root * J_Q, root * r)
-
-    def _normal(self, A: Array, B: Array, r: Array) -> Normal:
-        layout = self.layout
-        by_view = np.ascontiguousarray(A[:, :, layout.by_view])
-        U = np.empty((layout.n_views, 12, 12))
-        for i in range(layout.n_views):
-            rows = slice(layout.first_in_view[i], layout.first_in_view[i + 1])
-            J = by_view[:, :, rows].transpose(1, 0, 2).reshape(12, -1)
-            U[i] = J @ J.T
-        J_camera, J_point = A.transpose(2, 0, 1), B.transpose(2, 0, 1)
-        J_camera_T = np.swapaxes(J_camera, 1, 2)
-        J_point_T = np.swapaxes(J_point, 1, 2)
-        residual = r.T[..., None]
-        return Normal(
-            U=U,
-            V=layout.sum_points(J_point_T @ J_point),
-            coupling=StoredCoupling(layout, J_camera_T @ J_point),
-            g_cameras=layout.sum_views((J_camera_T @ residual)[..., 0]),
-            g_points=layout.sum_points((J_point_T @ residual)[..., 0]),
-        )
+            return normal_equations(self.layout, -root * J_P, -root * J_Q, root * r)
 
     def depth_blocks(self, P: Array, Q: Array) -> tuple[Array, Array]:
         """Return the diagonal blocks of Z^T Z, Z = d log depth / d(P, Q) weighted as residuals."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -54,6 +54,7 @@ class Envelope:
         return Envelope(first.astype(np.int32), slot.astype(np.intp))
 
     @staticmethod
+    @lru_cache(maxsize=32)
     def full(n: int) -> Envelope:
         """Return the envelope of a dense lower triangle."""
         return Envelope.of(np.zeros(n, np.intp))

@@ -1,13 +1,14 @@
 """A first reconstruction from random cameras: all views at once, by variable projection.
 
 The pseudo object space error (pOSE) of Hong and Zach is bilinear in cameras and points and has no
-pole at depth zero. Points are eliminated exactly, so that only the cameras are minimised over; the
-basin of its minimum is wide enough for random cameras.
+pole at depth zero. Points are eliminated exactly, so that only the cameras are minimised over. A
+first stage, nearly affine and with a ridge, leads from random cameras to where perspective follows.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +16,46 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge.kernels import Table
 from epigauge.multi_view.dampings import ByMatrix
+from epigauge.multi_view.engine import normal_equations
 from epigauge.multi_view.system import BundleSystem, Layout
+from epigauge.two_view.losses import robust_scale
 
-__all__ = ["FactorizationProblem", "factorized"]
+__all__ = ["FactorizationProblem", "FactorizationState", "factorized", "typical_block"]
 
 Array = NDArray[np.float64]
 
-#: Stages as (eta, ridge, ftol): weight of the affine part, weight of a ridge relative to
-#: `FactorizationProblem.unit`, and when to go on. The first stage is nearly affine, and its ridge
-#: keeps what few observations determine from running away; the second leaves perspective free.
-_STAGES = ((0.9, 0.1, 1e-3), (0.05, 1e-9, 1e-6))
-_MAX_ITER = 300
+#: First lambda, of the largest mean diagonal entry of a block.
+_FIRST = 1e-6
+
+_MAX_ITER = 200
+
+
+class _Stage(NamedTuple):
+    """One minimisation.
+
+    eta is the weight of the affine camera's error, ridge that of the ridge in units of
+    `typical_block`, ftol ends the stage; `reweighted` gives each observation a new weight before.
+    """
+
+    eta: float
+    ridge: float
+    ftol: float
+    reweighted: bool = False
+
+
+_AFFINE, _PERSPECTIVE = (0.9, 0.1, 1e-4), (0.05, 1e-9, 1e-6)
+
+_PLAIN = (_Stage(*_AFFINE), _Stage(*_PERSPECTIVE))
+
+#: Gross errors are told while the model is stiff; perspective then hardly changes their weights.
+_ROBUST = (
+    _Stage(*_AFFINE),
+    *8 * (_Stage(*_AFFINE, reweighted=True),),
+    *4 * (_Stage(*_PERSPECTIVE, reweighted=True),),
+)
+
+#: Where the weight of a residual is a quarter, in robust standard deviations.
+_DOUBTFUL = 5.0
 
 
 class FactorizationProblem:
@@ -33,7 +63,7 @@ class FactorizationProblem:
 
     0.5 sum |r|^2 + 0.5 ridge (sum |P_i without its last column|^2 + sum |X_j|^2), minimised over
     the points (X_j, 1) for given cameras. The ridge bounds the nuclear norm of the matrix of
-    projections (Srebro's identity) and leaves only rotations of the basis free.
+    projections, and of all changes of basis it leaves rotations free.
 
     Parameters
     ----------
@@ -42,13 +72,13 @@ class FactorizationProblem:
     layout : Layout
         Which observation belongs to what.
     q : ndarray, shape (2, N)
-        Conditioned measurements.
+        Measurements in coordinates of RMS one.
     weights : ndarray, shape (N,)
         Factor of each squared residual.
     eta : float
-        Share of the affine camera's error.
+        Weight of the affine camera's error; that of the object space error is 1 - eta.
     ridge : float
-        Positive.
+        Positive, so that every point is determined.
     """
 
     floor = 0.0
@@ -57,79 +87,72 @@ class FactorizationProblem:
         self, kernels: Table, layout: Layout, q: Array, weights: Array, eta: float, ridge: float
     ) -> None:
         self.kernels, self.layout, self.q = kernels, layout, q
-        self.root, self.eta = np.sqrt(weights), np.array(eta)
-        self.ridge = ridge * self.unit(layout)
+        self.root, self.eta, self.ridge = np.sqrt(weights), np.array(eta), ridge
         self.held = np.tile([1.0, 1.0, 1.0, 0.0], 3)
-
-    @staticmethod
-    def unit(layout: Layout) -> float:
-        """Return the typical size of a block of the points' normal matrix.
-
-        The three singular values of the matrix of projections are about the root of the number of
-        observations N; cameras and points share them evenly, and a point is seen in the share
-        N / (n m) of the views.
-        """
-        N = len(layout.view)
-        return N / (layout.n_views * layout.n_points) * float(np.sqrt(N))
 
     def evaluate(self, P: Array) -> FactorizationState:
         """Return the state of cameras (n, 3, 4), with the points that fit them best."""
         layout = self.layout
-        cameras = np.ascontiguousarray(P.transpose(1, 2, 0)[:, :, layout.view])
-        r, _, J_X = self._residuals(cameras, np.zeros((layout.n_points, 3)))
-        V = layout.sum_points(np.einsum("ikn,iln->nkl", J_X, J_X)) + self.ridge * np.eye(3)
-        g = layout.sum_points(np.einsum("ikn,in->nk", J_X, r))
-        X = -np.linalg.solve(V, g[..., None])[..., 0]
-        r, J_P, _ = self._residuals(cameras, X)
-        ridge = np.sum((self.held * P.reshape(-1, 12)) ** 2) + np.sum(X**2)
-        cost = 0.5 * float(np.sum(r**2) + self.ridge * ridge)
-        return FactorizationState(P, X, r, J_P, J_X, V, cost if np.isfinite(cost) else np.inf)
+        r, _, J_X = self._residuals(P, np.zeros((layout.n_points, 3)))
+        B = J_X.transpose(2, 0, 1)
+        B_T = np.swapaxes(B, 1, 2)
+        V = layout.sum_points(B_T @ B) + self.ridge * np.eye(3)
+        g = layout.sum_points(B_T @ r.T[..., None])
+        # The residuals are linear in X: one Gauss-Newton step from anywhere.
+        X = np.asarray(np.linalg.solve(V, -g)[..., 0])
+        squared = np.sum((self.held * P.reshape(-1, 12)) ** 2) + np.sum(X**2)
+        r, _, _ = self._residuals(P, X)
+        cost = 0.5 * float(np.sum(r**2) + self.ridge * squared)
+        return FactorizationState(P, X, cost if np.isfinite(cost) else float("inf"))
 
     def linearize(self, state: FactorizationState) -> BundleSystem:
-        """Return the normal equations; the points have no gradient."""
-        layout = self.layout
-        J_P, J_X = state.J_P.transpose(2, 0, 1), state.J_X.transpose(2, 0, 1)
-        J_P_T = np.swapaxes(J_P, 1, 2)
-        g = layout.sum_views((J_P_T @ state.r.T[..., None])[..., 0])
+        """Return the normal equations; the points, at their best, have no gradient."""
+        r, J_P, J_X = self._residuals(state.P, state.X)
+        normal = normal_equations(self.layout, J_P, J_X, r)
         return BundleSystem(
-            layout,
-            U=layout.sum_views(J_P_T @ J_P) + self.ridge * np.diag(self.held),
-            V=state.V,
-            W=J_P_T @ J_X,
-            g_cameras=g + self.ridge * self.held * state.P.reshape(-1, 12),
+            self.layout,
+            U=normal.U + self.ridge * np.diag(self.held),
+            V=normal.V + self.ridge * np.eye(3),
+            W=normal.coupling,
+            g_cameras=normal.g_cameras + self.ridge * self.held * state.P.reshape(-1, 12),
             g_points=np.zeros_like(state.X),
         )
 
     def retract(self, state: FactorizationState, step: Array) -> Array:
-        """Return the cameras that a step leads to; its points are found anew."""
+        """Return the cameras that a step leads to; their points are found anew."""
         return np.asarray(state.P + step[: state.P.size].reshape(state.P.shape))
 
-    def _residuals(self, cameras: Array, X: Array) -> tuple[Array, Array, Array]:
+    def distances(self, state: FactorizationState) -> Array:
+        """Return the length of each observation's residual, without its weight, (N,)."""
+        return np.asarray(np.linalg.norm(self._kernel(state.P, state.X)[0], axis=0))
+
+    def _residuals(self, P: Array, X: Array) -> tuple[Array, Array, Array]:
+        """Return weighted residuals (4, N) and Jacobians (4, 12, N), (4, 3, N)."""
+        r, J_P, J_X = (self.root * part for part in self._kernel(P, X))
+        return r, J_P, J_X
+
+    def _kernel(self, P: Array, X: Array) -> tuple[Array, Array, Array]:
+        cameras = np.ascontiguousarray(P.transpose(1, 2, 0)[:, :, self.layout.view])
         points = np.ascontiguousarray(X.T[:, self.layout.point])
-        found = self.kernels.pseudo_object_space(self.eta, cameras, points, self.q)
-        r, J_P, J_X = (self.root * part for part in found)
+        r, J_P, J_X = self.kernels.pseudo_object_space(self.eta, cameras, points, self.q)
         return r, J_P, J_X
 
 
 @dataclass(frozen=True)
 class FactorizationState:
-    """Cameras with their best points, residuals (4, N), Jacobians, point blocks and cost."""
+    """Cameras (n, 3, 4), their best points X (m, 3), and the cost."""
 
     P: Array
     X: Array
-    r: Array
-    J_P: Array
-    J_X: Array
-    V: Array
     cost: float
 
 
 class _OnCameras(ByMatrix):
-    """lambda I on the cameras only: with exact points this is variable projection (RW2)."""
+    """lambda I on the cameras only: with exact points, this is variable projection (RW2)."""
 
     def start(self, system: BundleSystem) -> float:
         """Return a small fraction of the largest diagonal entry."""
-        return 1e-6 * system.largest()
+        return _FIRST * system.largest()
 
     def matrix(self, system: BundleSystem) -> tuple[Array, Array]:
         """Return identities and zeros."""
@@ -137,17 +160,63 @@ class _OnCameras(ByMatrix):
         return np.broadcast_to(np.eye(a), (n, a, a)), np.zeros_like(system.V)
 
 
-def factorized(
-    kernels: Table, layout: Layout, q: Array, weights: Array, seed: int
-) -> tuple[Array, Array]:
-    """Return cameras (n, 3, 4) and points (m, 4) from random affine cameras.
+def typical_block(layout: Layout) -> float:
+    """Return the typical size of a point's block of the normal matrix, for points of their own.
+
+    The singular values of the matrix of projections, in coordinates of RMS one, are about the root
+    of the number of observations N; where cameras and points share them evenly, a block has this
+    size times the share N / (n m) of the views that see a point.
     """
-    random = np.random.default_rng(seed)
-    P = random.normal(size=(layout.n_views, 3, 4))
+    N = len(layout.view)
+    return N / (layout.n_views * layout.n_points) * float(np.sqrt(N))
+
+
+def factorized(
+    kernels: Table, layout: Layout, q: Array, weights: Array, *, seed: int, robust: bool
+) -> tuple[Array, Array]:
+    """Reconstruct from random affine cameras.
+
+    Parameters
+    ----------
+    kernels : Table
+        Backend.
+    layout : Layout
+        Which observation belongs to what.
+    q : ndarray, shape (2, N)
+        Measurements in coordinates of RMS one, centred.
+    weights : ndarray, shape (N,)
+        Factor of each squared residual.
+    seed : int
+        Of the random cameras.
+    robust : bool
+        Weigh down what fits badly, again and again.
+
+    Returns
+    -------
+    P, Q : ndarray, shape (n, 3, 4), (m, 4)
+        Cameras and points.
+
+    References
+    ----------
+    .. [1] J. H. Hong, C. Zach, "pOSE: pseudo object space error for initialization-free bundle
+       adjustment", CVPR 2018.
+    .. [2] J. H. Hong, C. Zach, A. Fitzgibbon, R. Cipolla, "Projective bundle adjustment from
+       arbitrary initialization using the variable projection method", ECCV 2016.
+    """
+    P = np.random.default_rng(seed).normal(size=(layout.n_views, 3, 4))
     P[:, 2] = 0.0, 0.0, 0.0, 1.0
-    for eta, ridge, ftol in _STAGES:
-        problem = FactorizationProblem(kernels, layout, q, weights, eta, ridge)
-        stopping = lm.Stopping(ftol=ftol, xtol=0.0, gtol=0.0, max_iter=_MAX_ITER)
+    unit, distances = typical_block(layout), np.zeros(len(layout.view))
+    for stage in _ROBUST if robust else _PLAIN:
+        trusted = weights * _trust(distances) if stage.reweighted else weights
+        ridge = stage.ridge * unit
+        problem = FactorizationProblem(kernels, layout, q, trusted, stage.eta, ridge)
+        stopping = lm.Stopping(ftol=stage.ftol, xtol=0.0, gtol=0.0, max_iter=_MAX_ITER)
         state = lm.minimize(problem, P, _OnCameras(), lm.Classic(), stopping).state
-        P = state.P
-    return P, np.column_stack([state.X, np.ones(len(state.X))])
+        P, distances = state.P, problem.distances(state)
+    return P, np.column_stack([state.X, np.ones(layout.n_points)])
+
+
+def _trust(distances: Array) -> Array:
+    """Return the weights of Geman and McClure, by distances in robust standard deviations."""
+    scale = _DOUBTFUL * max(robust_scale(distances), 1e-12)
+    return np.asarray(1.0 / (1.0 + (distances / scale) ** 2) ** 2)

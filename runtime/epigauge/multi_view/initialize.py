@@ -1,4 +1,4 @@
-"""A first reconstruction: two views, then the other cameras registered in turn."""
+"""A first reconstruction: two views, then the other cameras in turn; or all views at once."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import lm
+from epigauge._arguments import as_choice, as_count
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table, table
 from epigauge.multi_view.dampings import Covariant
+from epigauge.multi_view.factorization import factorized
 from epigauge.multi_view.gauge import normalized
 from epigauge.multi_view.problem import BundleProblem
 from epigauge.multi_view.resection import resect
@@ -23,6 +25,10 @@ from epigauge.two_view.refine import refine_fundamental
 __all__ = ["Frame", "initialize", "intersected"]
 
 Array = NDArray[np.float64]
+
+#: A registration has failed whose median residual is beyond this share of the RMS of the image
+#: coordinates.
+_FAR = 0.05
 Indices = NDArray[np.intp]
 
 #: Pairs of views, those with most common points, that are tried as a start.
@@ -74,20 +80,35 @@ class Frame:
 
 
 def initialize(
-    tracks: Tracks, *, incremental: bool = False, backend: str | None = None
+    tracks: Tracks,
+    *,
+    method: str = "auto",
+    incremental: bool = False,
+    robust: bool = False,
+    seed: int = 0,
+    backend: str | None = None,
 ) -> Reconstruction:
-    """Reconstruct from two views with strong geometry and register the other cameras in turn.
-
-    Robust against gross errors in some tracks: two-view geometry, resection and triangulation use
-    the Cauchy loss with a scale estimated from the residuals.
+    """Reconstruct without a start, well enough for `bundle_adjust` to begin from.
 
     Parameters
     ----------
     tracks : Tracks
         Observations.
+    method : {"auto", "registration", "factorization"}
+        "registration" begins with two views of strong geometry and registers the other cameras in
+        turn; robust against gross errors in some tracks by the Cauchy loss with a scale estimated
+        from the residuals. "factorization" needs no such views: it minimises a bilinear error over
+        all cameras at once, from random ones. "auto" registers, and where half the residuals are
+        beyond a twentieth of the RMS of the image coordinates, it factors robustly, too, and keeps
+        what has the lower median residual.
     incremental : bool
-        Adjust everything known, by a few robust steps, whenever a camera is registered: slower,
+        When registering, adjust everything known, by a few robust steps, with each camera: slower,
         but errors do not add up over long sequences.
+    robust : bool
+        When factoring, weigh down gross errors. Without them, the plain factorization leads to the
+        best minimum more often.
+    seed : int
+        When factoring, of the random cameras: another one is another chance.
     backend : {"c", "numpy", "casadi"}, optional
         Where the formulas are computed.
 
@@ -99,10 +120,27 @@ def initialize(
     Raises
     ------
     ArgumentError
-        If a view shares fewer than 6 points with those registered before it.
+        If a view cannot be registered since it shares fewer than 6 points with those before it.
+
+    References
+    ----------
+    .. [1] J. H. Hong, C. Zach, "pOSE: pseudo object space error for initialization-free bundle
+       adjustment", CVPR 2018.
     """
-    kernels = table(backend)
-    frame = Frame.of(tracks)
+    as_choice("method", method, ("auto", "registration", "factorization"))
+    as_count("seed", seed, at_least=0)
+    kernels, frame = table(backend), Frame.of(tracks)
+    if method == "factorization":
+        return _factored(tracks, frame, kernels, robust, seed)
+    found = _registered(tracks, frame, kernels, incremental)
+    median = _median_residual(tracks, found)
+    if method == "registration" or median <= _FAR * frame.scale:
+        return found
+    other = _factored(tracks, frame, kernels, True, seed)
+    return other if _median_residual(tracks, other) < median else found
+
+
+def _registered(tracks: Tracks, frame: Frame, kernels: Table, incremental: bool) -> Reconstruction:
     builder = _Builder(tracks, frame.conditioned(tracks), kernels)
     builder.begin(*_best_pair(tracks, frame))
     while not builder.registered.all():
@@ -110,6 +148,21 @@ def initialize(
         if incremental:
             builder.adjust()
     return Reconstruction(frame.cameras_out(builder.P), builder.Q)
+
+
+def _factored(
+    tracks: Tracks, frame: Frame, kernels: Table, robust: bool, seed: int
+) -> Reconstruction:
+    layout = Layout(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+    weights = np.asarray(tracks.weights)
+    q = frame.conditioned(tracks)
+    P, Q = factorized(kernels, layout, q, weights, seed=seed, robust=robust)
+    return Reconstruction(frame.cameras_out(P), Q)
+
+
+def _median_residual(tracks: Tracks, found: Reconstruction) -> float:
+    distances = np.linalg.norm(tracks.xy - found.project(tracks), axis=1)
+    return float(np.median(np.nan_to_num(distances, nan=np.inf)))
 
 
 def _best_pair(tracks: Tracks, frame: Frame) -> tuple[int, int]:

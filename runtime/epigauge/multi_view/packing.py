@@ -24,8 +24,9 @@ _ROWS, _MOST_LANES = 384, 56
 #: What the passes over an observation cost, in pairs of observations.
 _PASSES = 20
 
-#: Beyond so many cameras no envelope is looked for: the graph of cameras is a dense matrix.
-_MANY = 10_000
+#: Numbers of cameras for which an envelope is looked for: fewer save nothing, and the graph of more
+#: is too large for a dense matrix.
+_FEW, _MANY = 10, 10_000
 
 
 class Packed:
@@ -50,23 +51,26 @@ class Packed:
         self._observed = np.empty(rows, np.int32), np.empty(2 * rows), np.empty(rows)
         self.order: Indices | None = None
         self._envelope: Envelope | None = None
+        arrays = (self.lanes, self.rows, self._point, self._count, *self._observed)
+        self._bundle = Bundle(
+            layout.n_views,
+            layout.n_points,
+            len(self.lanes) - 1,
+            *map(address, arrays),
+            least=LEAST_WEIGHT * float(weights.max()),
+        )
         self._pack(layout.view, q, weights)
 
     def bundle(self, loss: Loss) -> Bundle:
         """Return the C structure."""
-        arrays = (self.lanes, self.rows, self._point, self._count, *self._observed)
-        return Bundle(
-            self._layout.n_views,
-            self._layout.n_points,
-            len(self.lanes) - 1,
-            *map(address, arrays),
-            least=LEAST_WEIGHT * float(np.max(self._weights)),
-            scale2=loss.scale**2,
-            loss=LOSSES.index(loss.name),
-        )
+        made = Bundle.from_buffer_copy(self._bundle)
+        made.scale2, made.loss = loss.scale**2, LOSSES.index(loss.name)
+        return made
 
     def shares(self, count: int) -> list[tuple[int, int]]:
         """Split the chunks into ranges of about equal work, that of the pairs of observations."""
+        if count == 1:
+            return [(0, len(self.lanes) - 1)]
         slots = np.diff(self.rows) // np.diff(self.lanes)
         work = np.cumsum(np.diff(self.rows) * (slots + _PASSES))
         cuts = np.searchsorted(work, work[-1] * np.arange(1, count) / count)
@@ -78,10 +82,9 @@ class Packed:
         if self._envelope is None:
             layout, n = self._layout, self._layout.n_views
             self._envelope = Envelope.full(n)
-            if n <= _MANY:
+            if _FEW <= n <= _MANY:
                 together = np.zeros((n, n), np.bool_)
-                bundle = self.bundle(Loss())
-                function("bundle_neighbours")(ctypes.byref(bundle), address(together))
+                function("bundle_neighbours")(ctypes.byref(self._bundle), address(together))
                 self._envelope, self.order = narrow(together)
             if self.order is not None:
                 number = np.argsort(self.order)[layout.view]
@@ -92,8 +95,8 @@ class Packed:
     def _pack(self, view: Indices, q: Array, weights: Array) -> None:
         """Copy the observations, sorted by point, then view."""
         arrays = [np.ascontiguousarray(a) for a in (self._layout.first, view, q, weights)]
-        bundle = self.bundle(Loss())
-        function("bundle_pack")(ctypes.byref(bundle), *map(address, (*arrays, *self._observed)))
+        reference = ctypes.byref(self._bundle)
+        function("bundle_pack")(reference, *map(address, (*arrays, *self._observed)))
 
 
 def _together(layout: Layout, counts: Indices) -> Indices:

@@ -289,9 +289,9 @@ def _express(
 
 def _is_plain(x: ArrayLike) -> bool:
     """Tell whether points need no conversion."""
-    if type(x) is not np.ndarray or x.dtype != np.float64 or not x.flags.c_contiguous:
+    if type(x) is not np.ndarray or x.dtype != np.float64:
         return False
-    return x.ndim == 2 and x.shape[1] == 2
+    return x.ndim == 2 and x.shape[1] == 2 and x.flags.c_contiguous and x.flags.aligned
 
 
 def _parts(fix: str | Sequence[str]) -> tuple[str, ...]:
