@@ -280,7 +280,11 @@ class TestInputs:
         x1, x2 = scene()
         for ones in (np.ones(50), [1] * 50):
             expected = eg.refine_fundamental(x1, x2)
-            assert_identical(eg.refine_fundamental(x1, x2, weights=ones), expected)
+            result = eg.refine_fundamental(x1, x2, weights=ones)
+            assert result.nfev == expected.nfev
+            # Sums may be associated in another way where nothing has to be multiplied.
+            np.testing.assert_allclose(result.F, expected.F, rtol=0.0, atol=1e-13)
+            np.testing.assert_allclose(result.covariance, expected.covariance, rtol=1e-9)
 
 
 def assert_identical(a: eg.FundamentalResult, b: eg.FundamentalResult) -> None:
