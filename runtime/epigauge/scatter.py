@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from epigauge.kernels import backend
 from epigauge.multi_view._native import address, function
 
-__all__ = ["scatter_constraints", "spreading_basis"]
+__all__ = ["scatter_constraints", "spread", "spreading_basis"]
 
 Array = NDArray[np.float64]
 
@@ -44,6 +44,13 @@ def spreading_basis(Q: Array) -> Array:
         moved = moved @ ((vectors / np.sqrt(values)) @ vectors.T)
         moved = moved / np.linalg.norm(moved, axis=1, keepdims=True)
     return T
+
+
+def spread(Q: Array) -> tuple[Array, Array]:
+    """Return the points T^-1 Q of unit norm, (m, 4), and T, the `spreading_basis`."""
+    T = spreading_basis(Q)
+    moved = np.linalg.solve(T, Q.T)
+    return np.ascontiguousarray((moved / np.linalg.norm(moved, axis=0)).T), T
 
 
 def scatter_constraints(Q: Array) -> Array:

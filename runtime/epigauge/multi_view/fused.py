@@ -11,6 +11,7 @@ import copy
 import ctypes
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -67,7 +68,7 @@ class Fused:
         """Return the envelope of the reduced system."""
         return self._packed.narrowed()
 
-    @property
+    @cached_property
     def direct(self) -> bool:
         """Tell whether the reduced system is to be stored and factored."""
         work, few = self.envelope.work, self.envelope.blocks <= most_blocks()
@@ -118,6 +119,16 @@ class Fused:
             for total, other in zip(sums[0], others, strict=True):
                 total += other
         return sums[0]
+
+    def over_points(self, call: Callable[[slice], Any]) -> list[Any]:
+        """Call a function with as many ranges of points as there are workers."""
+        if self._pool is None:
+            return [call(slice(0, self.layout.n_points))]
+        count = len(self._ranges)
+        edges = [self.layout.n_points * k // count for k in range(count + 1)]
+        parts = [slice(begin, end) for begin, end in zip(edges[:-1], edges[1:], strict=True)]
+        pending = [self._pool.submit(call, part) for part in parts]
+        return [future.result() for future in pending]
 
     def _share(self, call: Callable[[int, int, int], int]) -> None:
         if self._pool is None:

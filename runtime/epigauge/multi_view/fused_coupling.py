@@ -79,7 +79,10 @@ class FusedCoupling:
         """Return upper triangular T with T T^T = V^-1 for blocks V (m, b, b)."""
         if V.shape[1] != 4:
             return np.asarray(np.swapaxes(np.linalg.inv(np.linalg.cholesky(V)), 1, 2))
-        return _inverse_roots(V, None, 0.0, None)[0]
+        T = np.empty(V.shape)
+        if _root_points(np.ascontiguousarray(V), None, 0.0, None, T, None):
+            raise _singular("the block of a point")
+        return T
 
     def reduced(self, U: Array, roots: Array) -> FusedReduced:
         """Return the reduced system for camera blocks U, and roots of the inverse point blocks."""
@@ -111,16 +114,29 @@ class FusedCoupling:
             n, address(U), address(W_cameras), lam, address(A), address(white)
         ):
             raise _singular("the damping of a camera")
-        T, half = _inverse_roots(V, W_points, lam, g_points)
+        T, half = np.empty((m, 4, 4)), np.empty((m, 4))
+
+        def roots(part: slice) -> bool:
+            made = g_points[part], T[part], half[part]
+            return _root_points(V[part], W_points[part], lam, *made)
+
+        if any(own.over_points(roots)):
+            raise _singular("the block of a point")
         reduced = FusedReduced(replace(self, A=A), white, T, half)
         right = reduced.eliminated - (g_cameras[:, None] @ A)[:, 0]
         z = solved(reduced, right[..., None])
         step = np.empty(12 * n + 4 * m)
         step[: 12 * n] = (A @ z).ravel()
         coupled = self.to_points(T, step[: 12 * n].reshape(n, 12))
-        y = step[12 * n :]
-        energy = function("bundle_point_steps")(m, *map(address, (T, half, coupled, W_points, y)))
-        return step, energy + float(np.vdot(z, z))
+        y = step[12 * n :].reshape(m, 4)
+
+        def moved(part: slice) -> float:
+            arrays = (array[part] for array in (T, half, coupled, W_points, y))
+            return float(
+                function("bundle_point_steps")(part.stop - part.start, *map(address, arrays))
+            )
+
+        return step, sum(own.over_points(moved)) + float(np.vdot(z, z))
 
     def _step_at_once(
         self,
@@ -255,19 +271,12 @@ class FusedReduced:
         return self.U + (less if A is None else np.swapaxes(A, 1, 2) @ less @ A)
 
 
-def _inverse_roots(
-    V: Array, W: Array | None, lam: float, g: Array | None
-) -> tuple[Array, Array | None]:
-    """Return T with T T^T = (V + lam W)^-1, V^-1 without W, and T^T g."""
-    m = len(V)
-    V, T = np.ascontiguousarray(V), np.empty((m, 4, 4))
-    g = None if g is None else np.ascontiguousarray(g)
-    half = None if g is None else np.empty((m, 4))
-    if function("bundle_inverse_roots")(
-        m, address(V), address(W), lam, address(g), address(T), address(half)
-    ):
-        raise _singular("the block of a point")
-    return T, half
+def _root_points(
+    V: Array, W: Array | None, lam: float, g: Array | None, T: Array, half: Array | None
+) -> bool:
+    """Make T with T T^T = (V + lam W)^-1, V^-1 without W, and half = T^T g; tell of failure."""
+    arrays = map(address, (g, T, half))
+    return bool(function("bundle_inverse_roots")(len(V), address(V), address(W), lam, *arrays))
 
 
 def _singular(what: str) -> np.linalg.LinAlgError:

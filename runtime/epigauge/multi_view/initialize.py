@@ -13,13 +13,13 @@ from epigauge.errors import ArgumentError
 from epigauge.kernels import Table, table
 from epigauge.multi_view.dampings import Covariant
 from epigauge.multi_view.factorization import factorized
-from epigauge.multi_view.gauge import normalized
 from epigauge.multi_view.problem import BundleProblem
 from epigauge.multi_view.resection import resect
 from epigauge.multi_view.system import Layout
 from epigauge.multi_view.tracks import MIN_POINTS, MIN_VIEWS, Reconstruction, Tracks
+from epigauge.scatter import spread
 from epigauge.two_view.geometry import canonical_cameras
-from epigauge.two_view.losses import EFFICIENT, Loss, robust_scale
+from epigauge.two_view.losses import EFFICIENT, Loss, median, robust_scale
 from epigauge.two_view.refine import refine_fundamental
 
 __all__ = ["Frame", "initialize", "intersected"]
@@ -31,8 +31,11 @@ Array = NDArray[np.float64]
 _FAR = 0.05
 Indices = NDArray[np.intp]
 
-#: Pairs of views, those with most common points, that are tried as a start.
-_PAIRS = 40
+#: Pairs of views, those with most common points, that are tried as a start, and the fewest points.
+_PAIRS, _MATCHES = 40, 8
+
+#: Points whose views are counted at a time.
+_CHUNK = 4096
 
 
 @dataclass(frozen=True)
@@ -133,11 +136,11 @@ def initialize(
     if method == "factorization":
         return _factored(tracks, frame, kernels, robust, seed)
     found = _registered(tracks, frame, kernels, incremental)
-    median = _median_residual(tracks, found)
-    if method == "registration" or median <= _FAR * frame.scale:
+    residual = _median_residual(tracks, found)
+    if method == "registration" or residual <= _FAR * frame.scale:
         return found
     other = _factored(tracks, frame, kernels, True, seed)
-    return other if _median_residual(tracks, other) < median else found
+    return other if _median_residual(tracks, other) < residual else found
 
 
 def _registered(tracks: Tracks, frame: Frame, kernels: Table, incremental: bool) -> Reconstruction:
@@ -162,54 +165,77 @@ def _factored(
 
 def _median_residual(tracks: Tracks, found: Reconstruction) -> float:
     distances = np.linalg.norm(tracks.xy - found.project(tracks), axis=1)
-    return float(np.median(np.nan_to_num(distances, nan=np.inf)))
+    return median(np.nan_to_num(distances, nan=np.inf))
 
 
 def _best_pair(tracks: Tracks, frame: Frame) -> tuple[int, int]:
     """Choose the pair with the most points that no homography explains."""
-    incidence = np.zeros((tracks.n_points, tracks.n_views), dtype=np.float32)
-    incidence[tracks.point, tracks.view] = 1.0
-    common = np.triu(incidence.T @ incidence, 1)
-    best, chosen = -1.0, (0, 1)
-    for flat in np.argsort(-common, axis=None)[:_PAIRS]:
-        i, k = np.unravel_index(flat, common.shape)
-        if common[i, k] < 8:
-            break
-        x1, x2, _ = _matches(tracks, int(i), int(k))
-        parallax = _homography_residual(x1 - frame.origins[i], x2 - frame.origins[k])
-        score = float(common[i, k]) * parallax
-        if score > best:
-            best, chosen = score, (int(i), int(k))
-    if best < 0.0:
-        raise ArgumentError("tracks", "have no two views with 8 common points", "longer tracks")
-    return chosen
+    common = _common_points(tracks)
+    pairs = np.argsort(-common, axis=None)[:_PAIRS]
+    pairs = pairs[common.ravel()[pairs] >= _MATCHES]
+    if not len(pairs):
+        raise ArgumentError(
+            "tracks", f"have no two views with {_MATCHES} common points", "longer tracks"
+        )
+    chosen = np.stack(np.unravel_index(pairs, common.shape), axis=1)
+    rows = {view: _rows(tracks, view) for view in np.unique(chosen)}
+    both = [np.flatnonzero((rows[i] >= 0) & (rows[k] >= 0)) for i, k in chosen]
+    first = np.concatenate([[0], np.cumsum([len(points) for points in both])])
+    q = frame.conditioned(tracks).T
+    sides = (zip(side, both, strict=True) for side in chosen.T)
+    x1, x2 = (np.concatenate([q[rows[view][points]] for view, points in side]) for side in sides)
+    parallax = _homography_residuals(x1, x2, first)
+    i, k = chosen[np.argmax(np.diff(first) * parallax)]
+    return int(i), int(k)
 
 
-def _matches(tracks: Tracks, i: int, k: int) -> tuple[Array, Array, Indices]:
-    """Return the matches of two views and the points they belong to."""
-    rows_i, rows_k = np.flatnonzero(tracks.view == i), np.flatnonzero(tracks.view == k)
-    points, at_i, at_k = np.intersect1d(
-        tracks.point[rows_i], tracks.point[rows_k], assume_unique=True, return_indices=True
-    )
-    return tracks.xy[rows_i[at_i]], tracks.xy[rows_k[at_k]], points
+def _common_points(tracks: Tracks) -> Array:
+    """Return the number of points that each pair of views has in common, above the diagonal."""
+    common = np.zeros((tracks.n_views, tracks.n_views), dtype=np.float32)
+    for begin in range(0, tracks.n_points, _CHUNK):
+        some = slice(*np.searchsorted(tracks.point, [begin, begin + _CHUNK]))
+        incidence = np.zeros((min(_CHUNK, tracks.n_points), tracks.n_views), dtype=np.float32)
+        incidence[tracks.point[some] - begin, tracks.view[some]] = 1.0
+        common += incidence.T @ incidence
+    return np.triu(common, 1)
 
 
-def _homography_residual(x1: Array, x2: Array) -> float:
-    """Return the median transfer error of the homography fitted to matches (DLT)."""
-    scale = float(np.sqrt(np.mean(x1**2)))
-    a, b = np.column_stack([x1 / scale, np.ones(len(x1))]), x2 / scale
+def _rows(tracks: Tracks, view: int) -> Indices:
+    """Return the observation of each point in a view, -1 where there is none."""
+    own = np.flatnonzero(tracks.view == view)
+    rows = np.full(tracks.n_points, -1)
+    rows[tracks.point[own]] = own
+    return rows
+
+
+def _homography_residuals(x1: Array, x2: Array, first: Indices) -> Array:
+    """Return the median transfer error of the homography fitted to each group of matches (DLT).
+
+    Parameters
+    ----------
+    x1, x2 : ndarray, shape (m, 2)
+        Matches of all groups.
+    first : ndarray of int, shape (k + 1,)
+        First match of each group, and m.
+    """
+    a = np.column_stack([x1, np.ones(len(x1))])
     # Normal equations of rows (a, 0, -b_1 a) and (0, a, -b_2 a), block by block.
-    square = a.T @ a
-    across = [a.T @ (b[:, k, None] * a) for k in (0, 1)]
-    N = np.zeros((9, 9))
-    N[:3, :3] = N[3:6, 3:6] = square
-    N[:3, 6:], N[3:6, 6:] = -across[0], -across[1]
-    N[6:, :6] = N[:6, 6:].T
-    N[6:, 6:] = a.T @ (np.sum(b**2, axis=1)[:, None] * a)
-    h = a @ np.linalg.eigh(N)[1][:, 0].reshape(3, 3).T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        error = np.linalg.norm(h[:, :2] / h[:, 2:] - b, axis=1)
-    return float(np.median(np.nan_to_num(error, nan=0.0, posinf=0.0))) * scale
+    b1, b2 = x2.T
+    square = a[:, :, None] * a[:, None, :]
+    weights = np.stack([np.ones(len(a)), b1, b2, b1**2 + b2**2], axis=1)
+    sums = np.add.reduceat(weights[:, :, None, None] * square[:, None], first[:-1])
+    plain, across1, across2, both = np.moveaxis(sums, 1, 0)
+    N = np.zeros((len(first) - 1, 9, 9))
+    N[:, :3, :3] = N[:, 3:6, 3:6] = plain
+    N[:, :3, 6:] = N[:, 6:, :3] = -across1
+    N[:, 3:6, 6:] = N[:, 6:, 3:6] = -across2
+    N[:, 6:, 6:] = both
+    H = np.linalg.eigh(N)[1][:, :, 0].reshape(-1, 3, 3)
+    h = np.einsum("mij,mj->mi", np.repeat(H, np.diff(first), axis=0), a)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        error = np.linalg.norm(h[:, :2] / h[:, 2:] - x2, axis=1)
+    error = np.nan_to_num(error, nan=0.0, posinf=0.0)
+    return np.array([median(part) for part in np.split(error, first[1:-1])])
 
 
 class _Builder:
@@ -224,11 +250,9 @@ class _Builder:
 
     def begin(self, i: int, k: int) -> None:
         """Start with two views."""
-        rows = self.tracks.view == i, self.tracks.view == k
-        points, at_i, at_k = np.intersect1d(
-            self.tracks.point[rows[0]], self.tracks.point[rows[1]], return_indices=True
-        )
-        x1, x2 = self.q[:, rows[0]][:, at_i].T, self.q[:, rows[1]][:, at_k].T
+        rows = _rows(self.tracks, i), _rows(self.tracks, k)
+        points = np.flatnonzero((rows[0] >= 0) & (rows[1] >= 0))
+        x1, x2 = (self.q[:, own[points]].T for own in rows)
         result = refine_fundamental(x1, x2, loss="cauchy", max_iter=200)
         self.P[i], self.P[k] = canonical_cameras(result.F)
         self.Q[points] = result.points
@@ -294,11 +318,10 @@ class _Builder:
         self.known[points] = True
 
     def _spread(self) -> None:
-        """Move to the basis in which the known points are spread evenly."""
-        there = normalized().transformation(self.P[self.registered], self.Q[self.known])
-        self.P[self.registered], self.Q[self.known] = there.apply(
-            self.P[self.registered], self.Q[self.known]
-        )
+        """Move to the basis in which the known points are spread evenly, scales of norm one."""
+        self.Q[self.known], T = spread(self.Q[self.known])
+        P = self.P[self.registered] @ T
+        self.P[self.registered] = P / np.linalg.norm(P, axis=(1, 2), keepdims=True)
 
 
 def intersected(P: Array, problem: BundleProblem) -> Array:

@@ -21,12 +21,11 @@ Indices = NDArray[np.intp]
 #: Observations a chunk, so that it stays in the fast cache, and the most lanes.
 _ROWS, _MOST_LANES = 384, 56
 
+#: Cameras of which a full matrix is factored in no time.
+_FULL = 10
+
 #: What the passes over an observation cost, in pairs of observations.
 _PASSES = 20
-
-#: Numbers of cameras for which an envelope is looked for: fewer save nothing, and the graph of more
-#: is too large for a dense matrix.
-_FEW, _MANY = 10, 10_000
 
 
 class Packed:
@@ -82,7 +81,12 @@ class Packed:
         if self._envelope is None:
             layout, n = self._layout, self._layout.n_views
             self._envelope = Envelope.full(n)
-            if _FEW <= n <= _MANY:
+            if n > _FULL:
+                # The lowest view that shares a point with each.
+                lowest = np.arange(n)
+                np.minimum.at(lowest, layout.view, layout.view[layout.first[:-1]][layout.point])
+                self._envelope = Envelope.of(lowest)
+            if self._envelope.wide:
                 together = np.zeros((n, n), np.bool_)
                 function("bundle_neighbours")(ctypes.byref(self._bundle), address(together))
                 self._envelope, self.order = narrow(together)

@@ -11,7 +11,7 @@ from epigauge import lm
 from epigauge.kernels import Table
 from epigauge.linear import Dense, Levenberg
 from epigauge.multi_view._native import address, function
-from epigauge.multi_view.gauge import normalized
+from epigauge.scatter import spread
 from epigauge.two_view.losses import EFFICIENT, Loss, robust_scale
 
 __all__ = ["resect"]
@@ -57,17 +57,14 @@ def resect(kernels: Table, q: Array, Q: Array) -> Array:
 
 def _linear_camera(q: Array, Q: Array) -> Array:
     """Return the camera of least algebraic error, with points in a basis that spreads them."""
-    there = normalized().transformation(np.zeros((0, 3, 4)), Q.T)
-    points = there.apply(np.zeros((0, 3, 4)), Q.T)[1]
-    zero = np.zeros_like(points)
-    rows = np.concatenate(
-        [
-            np.hstack([points, zero, -q[0][:, None] * points]),
-            np.hstack([zero, points, -q[1][:, None] * points]),
-        ]
+    points, T = spread(Q.T)
+    # Normal equations of rows (X, 0, -x X) and (0, X, -y X), block by block.
+    plain, in_x, in_y, both = (
+        points.T @ (w[:, None] * points) for w in (np.ones(len(points)), *q, np.sum(q**2, axis=0))
     )
-    camera = np.linalg.svd(np.linalg.qr(rows, mode="r"))[2][-1].reshape(3, 4)
-    return np.asarray(camera @ np.linalg.inv(there.T))
+    zero = np.zeros((4, 4))
+    N = np.block([[plain, zero, -in_x], [zero, plain, -in_y], [-in_x, -in_y, both]])
+    return np.asarray(np.linalg.eigh(N)[1][:, 0].reshape(3, 4) @ np.linalg.inv(T))
 
 
 def _minimized_in_c(kernels: Table, q: Array, Q: Array, scale: float, P: Array) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from epigauge_generated.numpy_backend import losses
 from numpy.typing import NDArray
 
-__all__ = ["EFFICIENT", "LOSSES", "Loss", "Mixture", "robust_scale"]
+__all__ = ["EFFICIENT", "LOSSES", "Loss", "Mixture", "median", "robust_scale"]
 
 Array = NDArray[np.float64]
 _Values = tuple[Array, Array, Array]
@@ -102,6 +102,15 @@ class Mixture:
         return logarithm, np.logaddexp(logarithm, np.log(self.odds))
 
 
+def median(values: Array) -> float:
+    """Return what `numpy.median` returns of a vector, NaN if any is; several times as fast."""
+    half, odd = divmod(len(values), 2)
+    ordered = np.partition(values, (half, len(values) - 1))
+    if np.isnan(ordered[-1]):
+        return float("nan")
+    return float(ordered[half] if odd else 0.5 * (ordered[:half].max() + ordered[half]))
+
+
 def robust_scale(d: Array) -> float:
     """Estimate the standard deviation of distances, half of which may be gross errors.
 
@@ -112,4 +121,4 @@ def robust_scale(d: Array) -> float:
     ----------
     .. [1] P. J. Rousseeuw, A. M. Leroy, "Robust regression and outlier detection", 1987, ch. 5.
     """
-    return float(1.4826 * (1.0 + 5.0 / max(len(d) - 7, 1)) * np.median(np.abs(d)))
+    return float(1.4826 * (1.0 + 5.0 / max(len(d) - 7, 1)) * median(np.abs(d)))
