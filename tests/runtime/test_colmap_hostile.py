@@ -170,7 +170,11 @@ def test_a_damaged_row_spoils_its_pairs_only(database, table, change_, value, no
 
 @pytest.mark.parametrize(
     "F",
-    [b"short", "text", *(np.full(9, v).tobytes() for v in (np.nan, np.inf, 0.0, 1.0, 1e300, 5e-324))],
+    [
+        b"short",
+        "text",
+        *(np.full(9, v).tobytes() for v in (np.nan, np.inf, 0.0, 1.0, 1e300, 5e-324)),
+    ],
     ids=["short", "text", "NaN", "infinite", "zero", "rank 1", "huge", "tiny"],
 )
 def test_a_useless_stored_F_is_as_none(database, F) -> None:
