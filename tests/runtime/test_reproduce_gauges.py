@@ -33,6 +33,16 @@ def test_absent_data_are_said_to_be_absent():
     assert "left out" in str(section.content[0])
 
 
+def test_random_cameras_are_tried_without_measured_data(tmp_path):
+    paths = b2003.PAPER.reproduce(tmp_path, GaugeStudy(trials=2), {}, ["starts"])
+    assert {path.name for path in paths} == {"factorization.csv", "b2003.md", "b2003.html"}
+    with (tmp_path / "b2003" / "factorization.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["set"].split()[-1] for row in rows] == ["0.5", "0.1", "0.02"]
+    assert all(float(row["successes (%)"]) == 100.0 for row in rows[:2])
+    assert "left out" in (tmp_path / "b2003.md").read_text()
+
+
 def test_defect_tells_invariant_steps_from_others():
     tracks, start = GaugeStudy(trials=1).start(0.5, 0)
     there = random_transformation(np.random.default_rng(0), 10.0, tracks.n_views, tracks.n_points)

@@ -26,13 +26,14 @@ __all__ = ["Frame", "initialize", "intersected"]
 
 Array = NDArray[np.float64]
 
-#: A registration has failed whose median residual is beyond this share of the RMS of the image
-#: coordinates.
-_FAR = 0.05
 Indices = NDArray[np.intp]
 
 #: Pairs of views, those with most common points, that are tried as a start, and the fewest points.
 _PAIRS, _MATCHES = 40, 8
+
+#: A registration has failed whose median residual is beyond this share of the RMS of the image
+#: coordinates.
+_FAILED = 0.05
 
 #: Points whose views are counted at a time.
 _CHUNK = 4096
@@ -137,7 +138,7 @@ def initialize(
         return _factored(tracks, frame, kernels, robust, seed)
     found = _registered(tracks, frame, kernels, incremental)
     residual = _median_residual(tracks, found)
-    if method == "registration" or residual <= _FAR * frame.scale:
+    if method == "registration" or residual <= _FAILED * frame.scale:
         return found
     other = _factored(tracks, frame, kernels, True, seed)
     return other if _median_residual(tracks, other) < residual else found

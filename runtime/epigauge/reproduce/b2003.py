@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from epigauge.reproduce import gauge_invariance, gauge_sweeps
+from epigauge.reproduce import gauge_invariance, gauge_sweeps, hard_starts
 from epigauge.reproduce.gauge_runs import GaugeStudy
 from epigauge.reproduce.report import Section
 from epigauge.reproduce.run import Paper
@@ -18,7 +18,7 @@ EXPERIMENTS: dict[str, Callable[[GaugeStudy], Section]] = {
     "table2": gauge_sweeps.hotel,
     "bases": gauge_invariance.bases,
     "defects": gauge_invariance.defects,
-    "starts": gauge_invariance.starts,
+    "starts": hard_starts.starts,
 }
 
 

@@ -1,20 +1,13 @@
-"""Random bases, the defect of a step, and hard starts: what Bartoli 2003 does not measure."""
+"""Random bases and the defect of a step: what Bartoli 2003 does not measure."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from epigauge import kernels
 from epigauge.multi_view.adjust import BundleResult
-from epigauge.multi_view.gauge import equivalent, normalized
-from epigauge.multi_view.initialize import Frame, initialize, intersected
-from epigauge.multi_view.problem import BundleProblem
-from epigauge.multi_view.system import Layout
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.gauge import equivalent
 from epigauge.reproduce.gauge_runs import (
     LABELS,
-    SETS,
     STEPS,
     GaugeStudy,
     moved,
@@ -22,11 +15,8 @@ from epigauge.reproduce.gauge_runs import (
     step_defect,
 )
 from epigauge.reproduce.report import Claim, Section, Table
-from epigauge.two_view.losses import Loss
 
-__all__ = ["bases", "defects", "starts"]
-
-Array = NDArray[np.float64]
+__all__ = ["bases", "defects"]
 
 CONDITIONS = (1.0, 10.0, 100.0, 1000.0)
 _BASES = 20
@@ -147,73 +137,3 @@ def defects(study: GaugeStudy) -> Section:
             ),
         ],
     )
-
-
-def starts(study: GaugeStudy) -> Section:
-    """Hard starts: perturbed reconstructions and random cameras, on measured sequences."""
-    trials = max(1, study.trials // 2)
-    methods = ("covariant", "levenberg", "mclauchlan")
-    kinds = ("1 %", "5 %", "20 %", "random cameras")
-    rows = []
-    for name in study.track(list(SETS), "hard starts"):
-        tracks = study.measured(name)
-        if tracks is None:
-            continue
-        start = initialize(tracks)
-        for method in methods:
-            shares = []
-            for kind in kinds:
-                random = np.random.default_rng(study.seed)
-                good = 0
-                for _ in range(trials):
-                    begin = _hard_start(random, tracks, start, kind)
-                    good += study.adjust(tracks, begin, method).rms_px <= SETS[name] * (1 + 1e-5)
-                shares.append(100.0 * good / trials)
-            rows.append((name, LABELS[method], *shares))
-    return Section(
-        "Hard starts",
-        [
-            "Share (%) of runs that end within 1e-5 of the lowest RMS known. Perturbed: every "
-            "camera and point of the initial reconstruction, in the normalised basis, plus a "
-            "random vector of that share of its norm, then moved to a random basis of condition "
-            f"10. Random cameras: normally distributed entries, points triangulated. {trials} runs "
-            "each, at most 100 steps. For comparison: variable projection from an affine "
-            "stage reaches 88 to 100 % from random starts (Hong et al., ECCV 2016).",
-            Table(
-                "starts",
-                "Share of successes (%).",
-                ("set", "method", *kinds),
-                rows,
-                ("", "", ".0f"),
-            ),
-        ],
-    )
-
-
-def _hard_start(
-    random: np.random.Generator, tracks: Tracks, start: Reconstruction, kind: str
-) -> Reconstruction:
-    frame = Frame.of(tracks)
-    n, m = tracks.n_views, tracks.n_points
-    if kind == "random cameras":
-        layout = Layout(tracks.view, tracks.point, n, m)
-        return _random_reconstruction(random, tracks, frame, layout)
-    P, Q = frame.cameras_in(start.P), start.Q
-    P, Q = normalized().transformation(P, Q).apply(P, Q)
-    share = float(kind.split()[0]) / 100.0
-    P = P + share * random.normal(size=P.shape) / np.sqrt(12.0)
-    Q = Q + share * random.normal(size=Q.shape) / 2.0
-    there = random_transformation(random, 10.0, n, m)
-    P, Q = there.apply(P, Q)
-    return Reconstruction(frame.cameras_out(P), Q)
-
-
-def _random_reconstruction(
-    random: np.random.Generator, tracks: Tracks, frame: Frame, layout: Layout
-) -> Reconstruction:
-    """Return random cameras and the points that fit them best, linearly then refined."""
-    P = random.normal(size=(tracks.n_views, 3, 4))
-    q = frame.conditioned(tracks)
-    problem = BundleProblem(kernels.table(), layout, q, np.ones(len(tracks)), Loss())
-    Q = intersected(P, problem)
-    return Reconstruction(frame.cameras_out(P), problem.triangulated(P, Q))

@@ -23,7 +23,6 @@ from epigauge.two_view.losses import Loss
 
 __all__ = [
     "LABELS",
-    "SETS",
     "STEPS",
     "GaugeStudy",
     "Step",
@@ -47,13 +46,6 @@ LABELS = {
     "gauge_invariant": "GAUGE_INVARIANT",
     "gauge_invariant_factor": "GAUGE_INVARIANT, rank one",
     "covariant": "COVARIANT",
-}
-
-#: Measured sequences with the lowest RMS known, in pixels per coordinate.
-SETS = {
-    "library": 0.172830,
-    "corridor": 0.272462,
-    "dinosaur_trimmed": 1.114493,
 }
 
 _FTOL, _MAX_ITER = 1e-8, 100
