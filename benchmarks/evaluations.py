@@ -40,6 +40,8 @@ ROWS = {
 def run(row: str, distance: float, seed: int) -> tuple[float, int]:
     """Return cost and evaluations of one trial."""
     options, coordinates, schedule = ROWS[row]
+    if coordinates or schedule is not lm.Classic:  # the compiled loop has its own
+        options = options | {"backend": "numpy"}
     scene = eg.two_view_scene(distance=distance, seed=seed)
     with (
         mock.patch.multiple(conditioning, **{"RMS": conditioning.RMS, **coordinates}),

@@ -1,6 +1,6 @@
 """Many views: time an iteration, memory and growth of `bundle_adjust`, against the machine's limit.
 
-    python benchmarks/many_views.py [--quick] [--workers K] [--json FILE] [--plot FILE]
+    python benchmarks/many_views.py [--quick] [--json FILE] [--plot FILE]
 
 Every problem runs in a process of its own, from the same start, with the defaults (covariant
 damping, points re-triangulated). Milliseconds are those of one trial step of the history, best of
@@ -8,7 +8,8 @@ several runs. Memory is the peak beyond what the interpreter with epigauge takes
 arithmetic of the textbook's step at the rate of this machine's dgemm: a product (12x4) (4x4) (4x12)
 for each pair of observations of one point, and the Cholesky factor of the cameras' system within
 its envelope. The factors of rank one and two that the library multiplies instead need an eighth of
-it; so it may come below.
+it; so it may come below. Shares of the time are those of a run with one thread, by function of the
+C library.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import _one_thread  # noqa: F401  # isort: skip
 import argparse
 import importlib.util
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -30,27 +32,32 @@ import numpy as np
 from _many_view_peers import MOST, PEERS, RECORDED, RECORDED_GFLOPS
 from _many_view_scenes import GROWTH, PROBLEMS, Problem, banded
 from _measure import described, machine, markdown
+from _profile import profiled
 from epigauge.multi_view.envelope import Envelope, narrow
 
 #: Floating-point operations of a pair of observations, and of a product of two 12x12 blocks.
 PAIR, BLOCK = 2 * 12 * 4 * 12, 2 * 12**3
+
+#: Functions that take less everywhere are told together.
+_SHARE = 0.03
 
 
 def main() -> int:
     """Run the problems and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="small problems, few runs")
-    parser.add_argument("--workers", type=int, default=1, help="threads of bundle_adjust")
+    parser.add_argument("--workers", type=int, default=1, help=argparse.SUPPRESS)
     parser.add_argument("--json", type=Path, help="write all figures to a file")
     parser.add_argument("--plot", type=Path, help="write the growth as a picture")
     parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--seconds", type=float, default=3.0, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
-        print(json.dumps(measured(options.one, options.workers)))
+        print(json.dumps(measured(options.one, options.workers, options.seconds)))
         return 0
-    rate = dgemm_rate()
+    rate, seconds = dgemm_rate(), 0.2 if options.quick else options.seconds
     print(described(machine(("pyceres", "scipy"))))
-    print(f"dgemm: {rate / 1e9:.1f} GFLOP/s; workers: {options.workers}\n", flush=True)
+    print(f"\ndgemm: {rate / 1e9:.1f} GFLOP/s\n", flush=True)
     problems, peers = {}, []
     for name, (what, make) in PROBLEMS.items():
         if options.quick and name not in ("paper", "bal49"):
@@ -60,14 +67,17 @@ def main() -> int:
         except FileNotFoundError as error:
             print(f"{what}: {error}.\n")
             continue
-        problems[name] = in_own_process(problem, options.workers)
+        problems[name] = in_own_process(problem, 1, seconds)
+        if (os.cpu_count() or 1) > 1:
+            problems[name]["two_threads_ms"] = in_own_process(problem, 2, seconds)["ms"]
         problems[name]["limit_ms"] = 1e3 * operations(problem[0]) / rate
         if name == "paper":
             peers = against_peers(what, problem, problems[name])
     print(problem_table(problems, rate), "\n")
+    print(profile_table(problems), "\n")
     print(markdown(["peer, n = 5, m = 100", "ms", "steps", "cost", "ratio"], peers), "\n")
     sizes = GROWTH[:2] if options.quick else GROWTH
-    growth = [in_own_process(banded(n, 200 * n), options.workers) for n in sizes]
+    growth = [in_own_process(banded(n, 200 * n), 1, seconds) for n in sizes]
     print(growth_table(growth))
     if options.json:
         found = {"machine": machine(), "problems": problems, "growth": growth}
@@ -80,19 +90,20 @@ def main() -> int:
 # ---------------------------------------------------------------- one problem
 
 
-def in_own_process(problem: Problem, workers: int) -> dict[str, Any]:
+def in_own_process(problem: Problem, workers: int, seconds: float) -> dict[str, Any]:
     """Return what `measured` finds in a fresh interpreter."""
     tracks, start = problem
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "problem.npz"
         np.savez(path, view=tracks.view, point=tracks.point, xy=tracks.xy, P=start.P, Q=start.Q)
         command = [sys.executable, __file__, "--one", str(path), "--workers", str(workers)]
+        command += ["--seconds", str(seconds)]
         done = subprocess.run(command, check=True, capture_output=True, text=True)
     found: dict[str, Any] = json.loads(done.stdout)
     return found
 
 
-def measured(path: Path, workers: int) -> dict[str, Any]:
+def measured(path: Path, workers: int, seconds: float) -> dict[str, Any]:
     """Run one problem several times."""
     eg.bundle_adjust(*tiny())  # what is imported and allocated once
     before = peak_mb()
@@ -100,13 +111,20 @@ def measured(path: Path, workers: int) -> dict[str, Any]:
         tracks = eg.Tracks(file["view"], file["point"], file["xy"])
         start = eg.Reconstruction(file["P"], file["Q"])
     best, total, spent, runs = np.inf, np.inf, 0.0, 0
-    while runs < 3 or (spent < 3.0 and runs < 300):
+    while runs < 3 or (spent < seconds and runs < 300):
         begun = time.perf_counter()
         found = eg.bundle_adjust(tracks, start, workers=workers)
         whole = time.perf_counter() - begun
         steps = found.history[-1].seconds - found.history[0].seconds
         best, total = min(best, steps / found.nit), min(total, whole)
         spent, runs = spent + whole, runs + 1
+    used = peak_mb() - before
+    with profiled() as functions:
+        eg.bundle_adjust(tracks, start)
+        functions.clear()
+        begun = time.perf_counter()
+        eg.bundle_adjust(tracks, start)
+        whole = time.perf_counter() - begun
     return {
         "views": tracks.n_views,
         "points": tracks.n_points,
@@ -115,8 +133,9 @@ def measured(path: Path, workers: int) -> dict[str, Any]:
         "total_ms": 1e3 * total,
         "nfev": found.nfev,
         "cost": found.cost,
-        "mb": peak_mb() - before,
+        "mb": used,
         "runs": runs,
+        "shares": {name: seconds / whole for name, seconds in functions.most_common()},
     }
 
 
@@ -182,7 +201,8 @@ def against_peers(what: str, problem: Problem, own: dict[str, Any]) -> list[list
 
 def problem_table(problems: dict[str, dict[str, Any]], rate: float) -> str:
     """Return the problems beside the limit and the figures recorded for Ceres."""
-    header = ["problem", "observations", "ms / step", "evaluations", "total ms", "cost", "MB"]
+    header = ["problem", "observations", "ms / step", "two threads", "evaluations", "total ms"]
+    header += ["cost", "MB"]
     header += ["limit ms", "times limit", "Ceres ms (scaled)", "Ceres / ms", "Ceres / total"]
     rows = []
     for name, found in problems.items():
@@ -193,6 +213,9 @@ def problem_table(problems: dict[str, dict[str, Any]], rate: float) -> str:
                 PROBLEMS[name][0],
                 f"{found['observations']:,}",
                 f"{found['ms']:.3g}",
+                f"{found['ms'] / found['two_threads_ms']:.2f}x"
+                if "two_threads_ms" in found
+                else "-",
                 str(found["nfev"]),
                 f"{found['total_ms']:.3g}",
                 f"{found['cost']:.4f}",
@@ -205,6 +228,22 @@ def problem_table(problems: dict[str, dict[str, Any]], rate: float) -> str:
             ]
         )
     return markdown(header, rows)
+
+
+def profile_table(problems: dict[str, dict[str, Any]]) -> str:
+    """Return where the time goes."""
+    names = dict.fromkeys(name for found in problems.values() for name in found["shares"])
+    largest = [
+        name
+        for name in names
+        if max(found["shares"].get(name, 0.0) for found in problems.values()) >= _SHARE
+    ]
+    rows = []
+    for problem, found in problems.items():
+        shares = [found["shares"].get(name, 0.0) for name in largest]
+        cells = [f"{100 * share:.0f} %" for share in (*shares, 1.0 - sum(shares))]
+        rows.append([PROBLEMS[problem][0], *cells])
+    return markdown(["share of the time", *(f"`{name}`" for name in largest), "the rest"], rows)
 
 
 def growth_table(growth: list[dict[str, Any]]) -> str:

@@ -46,3 +46,29 @@ def test_kernels(tmp_path: Path) -> None:
     for sizes in found["seconds"].values():
         assert all(min(times) > 0.0 for kernels in sizes.values() for times in kernels.values())
     assert "**Gauss-Newton evaluation**" in printed
+
+
+def test_evaluations_has_rows_that_differ() -> None:
+    """Other coordinates and another schedule reach the solver, compiled loop or not."""
+    lines = run("evaluations.py", "--trials", 2).splitlines()[2:]
+    rows = dict(line.strip("| ").split(" | ", 1) for line in lines)
+    default = rows.pop("default")
+    for name in ("schedule Nielsen", "origin at the centroid", "RMS 0.5", "RMS 4"):
+        assert rows[name] != default, name
+
+
+def test_many_views(tmp_path: Path) -> None:
+    printed = run("many_views.py", "--quick", "--json", tmp_path / "found.json")
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert "| n = 5, m = 100, Bartoli 2003 |" in printed
+    for own in found["problems"].values():
+        assert 0.0 < own["ms"] <= own["total_ms"]
+        assert 0.0 < sum(own["shares"].values()) < 1.0
+    small, large = found["growth"]
+    assert small["mb"] < large["mb"]
+
+
+def test_sequences(tmp_path: Path) -> None:
+    run("sequences.py", "--quick", "--json", tmp_path / "found.json")
+    for own in json.loads((tmp_path / "found.json").read_text()).values():
+        assert own["nfev"] <= 25
