@@ -71,6 +71,7 @@ $(STAMPS)/venv:
 	@mkdir -p $(STAMPS) && touch $@
 
 $(STAMPS)/package: $(STAMPS)/venv $(SOURCES)
+	@echo "Installing; compiling the C library takes a minute."
 	$(PIP) install '.[cli,plot]'
 	@touch $@
 

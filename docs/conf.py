@@ -24,6 +24,7 @@ extensions = [
     "sphinx.ext.viewcode",
     "sphinx-mathjax-offline",
     "sphinx_design",
+    "anchors",
     "formulas",
     "listings",
     "names",

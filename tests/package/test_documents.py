@@ -95,6 +95,14 @@ def test_every_block_is_of_a_kind_that_is_known(page: Path) -> None:
     assert not re.search(r"^```\{code", page.read_text(), re.MULTILINE)  # it would not be run
 
 
+def test_links_of_the_readme_lead_to_files() -> None:
+    """Those of the other pages are checked when the documentation is built."""
+    targets = re.findall(r"\]\(([^)\s#]+)", (documents.CHECKOUT / "README.md").read_text())
+    missing = [t for t in targets if "://" not in t and not (documents.CHECKOUT / t).exists()]
+    assert targets
+    assert missing == []
+
+
 @pytest.mark.parametrize("name", ["epigauge", *MODULES])
 def test_every_public_name_is_in_the_reference(name: str) -> None:
     pages = (documents.CHECKOUT / "docs" / "api").glob("*.rst")

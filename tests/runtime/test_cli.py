@@ -171,7 +171,7 @@ def test_a_bad_file_is_one_clear_line_and_exit_2(run, tmp_path, content, words) 
         (["--max-iter", "0"], "max_iter"),
         (["--plot", "picture.pdf"], "picture.pdf"),
         (["-o", "result.pkl"], "result.pkl"),
-        (["-o", "absent/result.npz"], "absent"),
+        (["-o", "absent/result.npz"], "epigauge: absent: No such file or directory"),
         (["--inliers"], "marks no inliers"),
     ],
 )
@@ -182,7 +182,10 @@ def test_bad_options_are_one_clear_line_and_exit_2(run, pair_file, options, word
     assert err.count("\n") == 1
 
 
-@pytest.mark.parametrize("options", [["-o", "r.pkl"], ["--plot", "r.gif"]])
+@pytest.mark.parametrize(
+    "options",
+    [["-o", "r.pkl"], ["--plot", "r.gif"], ["-o", "absent/r.npz"], ["--plot", "absent/r.svg"]],
+)
 def test_names_of_outputs_are_checked_before_the_work(run, pair_file, monkeypatch, options) -> None:
     monkeypatch.setattr(eg, "refine_fundamental", pytest.fail)
     assert run("refine", pair_file, *options)[0] == 2

@@ -187,6 +187,16 @@ def test_a_run_that_does_not_converge_exits_1_and_still_answers(run, file) -> No
     assert run("compare", file, "--methods", "free,bartoli", "--max-iter", 1)[0] == 1
 
 
+@pytest.mark.parametrize("command", ["bundle", "compare"])
+def test_a_start_without_a_finite_cost_is_bad_input(run, file, tmp_path, command) -> None:
+    P, Q = SCENE.true.P.copy(), SCENE.true.Q.copy()
+    P[1, 2], Q[0] = (1.0, 0.0, 0.0, -1.0), (1.0, 0.0, 0.0, 1.0)  # in the focal plane, exactly
+    eg.save_reconstruction(tmp_path / "s.npz", eg.Reconstruction(P, Q))
+    code, out, err = run(command, file, "--start", tmp_path / "s.npz")
+    assert (code, out) == (2, "")
+    assert "s.npz: has no finite cost" in err
+
+
 def test_progress_is_shown_on_a_terminal_only(run, file, monkeypatch) -> None:
     shown = []
     real = Progress.update

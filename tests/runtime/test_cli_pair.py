@@ -166,6 +166,7 @@ def test_bad_images_end_with_2_and_one_line(run, photos, tmp_path, name, words) 
     ("options", "words"),
     [
         (["--plot", "a.pdf"], "a name ending in .png, .svg, .html"),
+        (["--plot", "absent/a.html"], "absent: No such file or directory"),
         (["-o", "a.csv"], "a name ending in .npz, .json"),
         (["--detector", "surf"], "detector is 'surf'"),
         (["--ratio", "7"], "ratio is 7"),

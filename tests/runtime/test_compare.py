@@ -97,7 +97,7 @@ def test_picture_has_a_table_with_the_fastest_first_and_failures_last() -> None:
     words = [text.get_text() for text in table.texts]
     for row in rows:
         k = words.index(row.method)
-        cells = [f"{row.nfev}", f"{row.seconds:.2f}", f"{row.rms_px:.6f}"]
+        cells = [f"{row.nfev}", f"{row.seconds:.3f}", f"{row.rms_px:.6f}"]
         assert words[k + 1 : k + 4] == cells
     colours = {text.get_text(): text.get_color() for text in table.texts}
     assert colours["covariant"] != colours["levenberg"] == colours["bartoli"]

@@ -7,6 +7,7 @@ import json
 import os
 import stat
 import struct
+import sys
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import MAX_MATCHES, Matches, load_matches, plain, save_matches, save_result
+from epigauge.io._npz import write_npz
 from epigauge.io.output import writing
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -457,6 +459,15 @@ def test_json_holds_the_same_numbers(tmp_path) -> None:
     }
 
 
+def test_json_has_a_line_a_row_of_a_matrix(tmp_path) -> None:
+    save_result(tmp_path / "r.json", RESULT, many=[0] * 40, words=["a, [b", "c"], names=["a", "b"])
+    lines = (tmp_path / "r.json").read_text().splitlines()
+    assert sum(line.startswith("  [") for line in lines) == len(RESULT.F)
+    assert ' "names": ["a", "b"]' in lines
+    assert lines.count("  0,") == 39  # a long list is no row
+    assert json.loads("".join(lines))["words"] == ["a, [b", "c"]
+
+
 def test_npz_holds_the_same_numbers(tmp_path) -> None:
     save_result(tmp_path / "r.npz", RESULT, matches=9)
     with np.load(tmp_path / "r.npz", allow_pickle=False) as found:
@@ -496,6 +507,38 @@ def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+# Where the archive itself is being made or dropped, it complains when it is collected.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_interruption_at_any_line_of_writing_an_archive_comes_through() -> None:
+    def interrupted(after: int) -> bool:
+        """Write arrays; end that after so many lines of `zipfile`, as Ctrl-C would."""
+        left = after
+
+        def trace(frame, event, _):
+            nonlocal left
+            if event == "line" and "zipfile" in frame.f_code.co_filename:
+                left -= 1
+                if left == 0:
+                    raise KeyboardInterrupt
+            return trace
+
+        before = sys.gettrace()
+        sys.settrace(trace)
+        try:
+            write_npz(io.BytesIO(), {"F": X1, "message": "done"})
+        except KeyboardInterrupt:
+            return True
+        finally:
+            sys.settrace(before)
+        return left <= 0  # in what collects the archive
+
+    assert not interrupted(100_000)
+    after = 1
+    while interrupted(after):
+        after += 2
+    assert after > 100
+
+
 def test_written_file_replaces_the_old_one_in_one_step(tmp_path) -> None:
     path = write(tmp_path / "r.json", "old")
     with writing(path) as file:
@@ -515,6 +558,12 @@ def test_written_file_has_usual_permissions_and_keeps_a_link(tmp_path) -> None:
     assert (tmp_path / "link.json").is_symlink()
     assert json.loads(target.read_text())["message"] == "done"
     assert stat.S_IMODE(target.stat().st_mode) == plain_mode
+
+
+def test_a_file_that_cannot_be_opened_is_told_by_the_name_that_was_given(tmp_path) -> None:
+    with pytest.raises(FileNotFoundError) as caught:
+        save_result(tmp_path / "absent" / "r.json", RESULT)
+    assert caught.value.filename == str(tmp_path / "absent" / "r.json")
 
 
 def test_directory_is_not_replaced(tmp_path) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import errno
 import functools
-import json
 import os
 import sys
 from collections.abc import Callable
@@ -15,7 +15,8 @@ from rich.console import Console
 from rich.table import Table
 
 from epigauge.errors import EpigaugeError
-from epigauge.io import plain
+from epigauge.io._common import check_suffix
+from epigauge.io.output import json_text, plain
 
 P = ParamSpec("P")
 
@@ -58,9 +59,20 @@ def console() -> Console:
     return Console(stderr=True, highlight=False)
 
 
+def check_target(path: Path, *suffixes: str) -> None:
+    """Check what a run that may be long will write, before it starts."""
+    suffix = check_suffix(path, *suffixes)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
+    if suffix in (".png", ".svg"):
+        from epigauge.plots._style import need_matplotlib
+
+        need_matplotlib()
+
+
 def write_json(document: dict[str, Any]) -> None:
     """Write one JSON document to stdout."""
-    typer.echo(json.dumps(plain(document), indent=1, allow_nan=False))
+    typer.echo(json_text(plain(document)))
 
 
 def facts(title: str, rows: dict[str, str]) -> Table:
@@ -76,6 +88,11 @@ def facts(title: str, rows: dict[str, str]) -> Table:
 def shown(path: Path) -> str:
     """Return a path as the caller wrote it, without what a terminal would interpret."""
     return "".join(c if c.isprintable() else "?" for c in str(path))
+
+
+def named(path: Path) -> str:
+    """Return what to call a file in a title: its name and that of its directory."""
+    return shown(Path(*path.parts[-2:]))
 
 
 def _one_line(error: Exception) -> str:

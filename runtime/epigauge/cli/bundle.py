@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import time
 from functools import cached_property
 from pathlib import Path
@@ -21,8 +19,10 @@ from epigauge.cli._common import (
     INTERRUPTED,
     NOT_CONVERGED,
     Json,
+    check_target,
     console,
     facts,
+    named,
     shown,
     write_json,
 )
@@ -37,7 +37,6 @@ from epigauge.io import (
     save_ply,
     save_result,
 )
-from epigauge.io._common import check_suffix
 from epigauge.io.tracks import arrays_of
 from epigauge.multi_view.display import Display, display
 from epigauge.multi_view.pinhole import PinholeModel, pinhole_model
@@ -143,31 +142,15 @@ def bundle(
     if json:
         write_json(answer.document())
     else:
-        answer.report(out, watch.interrupted)
         for P in result.reconstruction.P:
             typer.echo(" ".join(f"{value:.17g}" for value in P.ravel()))
+        answer.report(out, watch.interrupted)  # last: many cameras would scroll it away
     if watch.interrupted:
         out.print(f"[bold red]interrupted[/] after {result.nfev} evaluations: this is the best")
         return INTERRUPTED
     if refused is not None:
         raise refused
     return DONE if result.success else NOT_CONVERGED
-
-
-def check_target(path: Path, *suffixes: str) -> None:
-    """Check what a run that may be long will write, before it starts."""
-    suffix = check_suffix(path, *suffixes)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
-    if suffix in (".png", ".svg"):
-        from epigauge.plots._style import need_matplotlib
-
-        need_matplotlib()
-
-
-def named(path: Path) -> str:
-    """Return what to call a file in a picture: its name and that of its directory."""
-    return shown(Path(*path.parts[-2:]))
 
 
 def first_reconstruction(
@@ -182,8 +165,18 @@ def first_reconstruction(
                 raise FileFormatError(tracks, str(error)) from None
             raise
     if start == tracks and file.start is not None:
-        return file.start
-    return load_reconstruction(start)
+        found = file.start
+    else:
+        found = load_reconstruction(start)
+    size = (file.tracks.n_views, file.tracks.n_points)
+    # A reconstruction of another size is refused by who takes both.
+    fits = (len(found.P), len(found.Q)) == size
+    if fits and not np.isfinite(found.rms_px(file.tracks)):
+        raise FileFormatError(
+            start,
+            "has no finite cost: some point is in or near the focal plane of a camera that sees it",
+        )
+    return found
 
 
 def gauge_named(name: str | None) -> eg.gauge.Gauge | None:

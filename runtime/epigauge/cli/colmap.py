@@ -19,10 +19,19 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 from rich.table import Table
 
-from epigauge.cli._common import BAD_INPUT, DONE, Json, console, facts, shown, write_json
+from epigauge.cli._common import (
+    BAD_INPUT,
+    DONE,
+    Json,
+    check_target,
+    console,
+    facts,
+    shown,
+    write_json,
+)
 from epigauge.colmap import DatabaseResult, refine_database
 from epigauge.io import save_result, writing
-from epigauge.io._common import check_suffix, cut
+from epigauge.io._common import cut
 
 #: Rows of the table before it leaves out what is in order.
 _ROWS = 40
@@ -59,7 +68,7 @@ def colmap(
     without, the file is only read. Everything else in it stays as it is.
     """
     if output is not None:
-        check_suffix(output, ".csv", ".npz")
+        check_target(output, ".csv", ".npz")
     out = console()
     begin = time.perf_counter()
     with _progress(out, not json) as callback:

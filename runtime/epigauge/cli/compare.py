@@ -17,7 +17,9 @@ from epigauge.cli._common import (
     INTERRUPTED,
     NOT_CONVERGED,
     Json,
+    check_target,
     console,
+    named,
     shown,
     write_json,
 )
@@ -28,9 +30,7 @@ from epigauge.cli.bundle import (
     MaxIter,
     Start,
     TracksFile,
-    check_target,
     first_reconstruction,
-    named,
 )
 from epigauge.io import load_track_file
 from epigauge.multi_view.compare import Comparison
@@ -119,7 +119,7 @@ def print_table(out: Console, comparison: Comparison, title: str) -> None:
             str(row.nfev),
             f"{row.rms_px:.6f}",
             f"{row.cost:.8g}",
-            f"{row.seconds:.2f}",
+            f"{row.seconds:.3f}",
             "yes" if row.success else "no",
             style=style if row.success else "red",
         )

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import track
@@ -108,9 +109,11 @@ def _table(found: dict[str, Trials], distance: float, trials: int) -> Table:
         title=f"{_POINTS} points at {distance:g} m, noise of 2 px variance, {scenes}",
         title_justify="left",
         caption="evals: evaluations of the cost; RMS: of the residual coordinates;\n"
-        "error: RMS distance of the true points to the estimated epipolar geometry;\n"
+        "error: RMS distance of the true points to the geometry found;\n"
         "ms: median time of one estimate",
         caption_justify="left",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
     )
     table.add_column("method")
     for heading in ("evals", "cost px^2", "RMS px", "error px", "ms"):

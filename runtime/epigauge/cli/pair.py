@@ -12,13 +12,22 @@ import typer
 from rich.markup import escape
 
 import epigauge as eg
-from epigauge.cli._common import DONE, NOT_CONVERGED, Json, console, facts, shown, write_json
+from epigauge.cli._common import (
+    DONE,
+    NOT_CONVERGED,
+    Json,
+    check_target,
+    console,
+    facts,
+    named,
+    shown,
+    write_json,
+)
 from epigauge.cli.refine import epipoles, standard_deviations
 from epigauge.errors import ArgumentError
 from epigauge.images import ImageMatches, match_images
 from epigauge.images.summary import explained, summary
 from epigauge.io import plain, save_result
-from epigauge.io._common import check_suffix
 from epigauge.two_view.robust import RobustResult
 
 _AT_LEAST = 8
@@ -80,9 +89,9 @@ def pair(
     a file of matches too: `epigauge refine result.npz --inliers`.
     """
     if plot is not None:
-        check_suffix(plot, ".png", ".svg", ".html")
+        check_target(plot, ".png", ".svg", ".html")
     if output is not None:
-        check_suffix(output, ".npz", ".json")
+        check_target(output, ".npz", ".json")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # of damaged files our own errors tell
     out = console()
     begin = time.perf_counter()
@@ -141,7 +150,7 @@ def pair(
         write_json(everything | more)
     else:
         rows = summary(result, matches, seconds) | {"status": result.message}
-        title = escape(f"{shown(image1)} - {shown(image2)}")
+        title = escape(f"{named(image1)} - {named(image2)}")
         out.print(facts(title, {name: escape(value) for name, value in rows.items()}))
         for flag, sentence in explained(result).items():
             out.print(f"[bold red]{escape(flag)}:[/] {escape(sentence)}", soft_wrap=True)

@@ -13,10 +13,18 @@ from rich.markup import escape
 from rich.table import Table
 
 import epigauge as eg
-from epigauge.cli._common import DONE, NOT_CONVERGED, Json, console, facts, shown, write_json
+from epigauge.cli._common import (
+    DONE,
+    NOT_CONVERGED,
+    Json,
+    check_target,
+    console,
+    facts,
+    shown,
+    write_json,
+)
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import Matches, load_matches, plain, save_result
-from epigauge.io._common import check_suffix
 
 Array = NDArray[np.float64]
 
@@ -59,9 +67,9 @@ def refine(
     --json everything known about it but the derivatives.
     """
     if plot is not None:
-        check_suffix(plot, ".png", ".svg")
+        check_target(plot, ".png", ".svg")
     if output is not None:
-        check_suffix(output, ".npz", ".json")
+        check_target(output, ".npz", ".json")
     pair = load_matches(matches, inliers=inliers)
     begin = time.perf_counter()
     try:

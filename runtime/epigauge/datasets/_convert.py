@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from epigauge.errors import MissingPackageError
 from epigauge.io import writing
+from epigauge.io._npz import write_npz
 
 Array = NDArray[np.float64]
 Size = tuple[int, int] | None
@@ -126,13 +127,11 @@ def _write(
     """Write tracks of shape (number of views, number of points), and further arrays."""
     size: dict[str, Any] = {} if image_size is None else {"image_size": np.array(image_size)}
     with writing(target) as file:
-        np.savez_compressed(
-            file,
-            view=view.astype(np.int32),
-            point=point.astype(np.int32),
-            xy=xy,
-            n_views=shape[0],
-            n_points=shape[1],
-            **size,
-            **more,
-        )
+        arrays: dict[str, Any] = {
+            "view": view.astype(np.int32),
+            "point": point.astype(np.int32),
+            "xy": xy,
+            "n_views": shape[0],
+            "n_points": shape[1],
+        }
+        write_npz(file, arrays | size | more)

@@ -1,17 +1,17 @@
-"""NPZ files, read without unpickling and with sizes checked before allocating."""
+"""NPZ files, read without unpickling and with sizes checked before allocating; and written."""
 
 from __future__ import annotations
 
 import math
 import re
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from epigauge.errors import FileFormatError
 from epigauge.io._common import MAX_MATCHES, cut, listed
@@ -112,6 +112,30 @@ def _read_header(path: Path, name: str, stream: IO[bytes]) -> tuple[tuple[int, .
         order[1] == "True",
         np.dtype(descr[1]),
     )
+
+
+def write_npz(file: IO[bytes], arrays: Mapping[str, ArrayLike]) -> None:
+    """Write arrays as `numpy.savez_compressed` does, but let an interruption through.
+
+    On the way out NumPy closes the archive also where Ctrl-C came in the middle of an array: then
+    that fails, and its error takes the place of the interruption.
+
+    Parameters
+    ----------
+    file : binary file
+        Where to write to; what was written of it is useless after an exception.
+    arrays : mapping of str to array_like
+        No objects.
+    """
+    archive = zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED)
+    try:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
+        archive.close()
+    except BaseException:
+        archive.fp = None  # so that it does not try again to end its table of contents
+        raise
 
 
 @contextmanager

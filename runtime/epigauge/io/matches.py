@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from epigauge._arguments import as_matches, as_weights
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._common import PathLike, check_suffix, cut
-from epigauge.io._npz import read_npz
+from epigauge.io._npz import read_npz, write_npz
 from epigauge.io._text import Columns, read_text
 from epigauge.io.output import writing
 
@@ -121,7 +121,7 @@ def save_matches(path: PathLike, matches: Matches) -> None:
                 "image_size2": matches.image_size2,
             }
             given: dict[str, Any] = {k: v for k, v in optional.items() if v is not None}
-            np.savez_compressed(file, x1=x1, x2=x2, **given)
+            write_npz(file, {"x1": x1, "x2": x2} | given)
             return
         comma = "," if suffix == ".csv" else " "
         head = comma.join(names) if suffix == ".csv" else "# " + comma.join(names)

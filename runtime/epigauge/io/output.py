@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +16,12 @@ from typing import IO, Any
 import numpy as np
 
 from epigauge.io._common import PathLike, check_suffix
+from epigauge.io._npz import write_npz
+
+#: A list of numbers or words as `json` breaks it up: no text in JSON holds a line break of its own.
+_SHORT_LIST = re.compile(r"\[\n([^\[\]{}]*)\n\s*\]")
+#: Entries that it may have to be put on one line: a camera's.
+_ROW = 12
 
 
 def save_result(path: PathLike, result: Any, **more: Any) -> None:
@@ -45,8 +52,7 @@ def save_result(path: PathLike, result: Any, **more: Any) -> None:
     suffix = check_suffix(path, ".npz", ".json")
     with writing(path) as file:
         if suffix == ".json":
-            document = plain(result) | plain(more)
-            file.write(json.dumps(document, indent=1, allow_nan=False).encode() + b"\n")
+            file.write(json_text(plain(result) | plain(more)).encode() + b"\n")
         else:
             arrays: dict[str, Any] = {
                 name: np.asarray(value) for name, value in (_arrays(result) | more).items()
@@ -54,7 +60,7 @@ def save_result(path: PathLike, result: Any, **more: Any) -> None:
             pickled = [name for name, array in arrays.items() if array.dtype.hasobject]
             if pickled:
                 raise TypeError(f"no array form of {', '.join(pickled)}")
-            np.savez_compressed(file, **arrays)
+            write_npz(file, arrays)
 
 
 def plain(value: Any) -> Any:
@@ -90,6 +96,16 @@ def plain(value: Any) -> Any:
     raise TypeError(f"no plain form of {type(value).__name__}")
 
 
+def json_text(document: dict[str, Any]) -> str:
+    """Write plain data as JSON, in which a row of a matrix is a line and not a line a number."""
+    return _SHORT_LIST.sub(_on_one_line, json.dumps(document, indent=1, allow_nan=False))
+
+
+def _on_one_line(found: re.Match[str]) -> str:
+    items = [item.strip() for item in found[1].split(",\n")]
+    return f"[{', '.join(items)}]" if len(items) <= _ROW else found[0]
+
+
 @contextmanager
 def writing(path: PathLike) -> Iterator[IO[bytes]]:
     """Open a file that takes its final name only after everything has been written.
@@ -114,11 +130,19 @@ def writing(path: PathLike) -> Iterator[IO[bytes]]:
         raise OSError(f"{os.fspath(path)}: exists and is not a regular file")
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
     try:
-        with temporary.open("xb") as file:
+        with _opened(temporary, path) as file:
             yield file
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _opened(temporary: Path, path: PathLike) -> IO[bytes]:
+    try:
+        return temporary.open("xb")
+    except OSError as error:
+        error.filename = os.fspath(path)  # the name that the caller knows
+        raise
 
 
 def _arrays(result: Any) -> dict[str, Any]:

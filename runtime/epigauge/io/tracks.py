@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._bal import read_bal, write_bal
 from epigauge.io._common import MAX_MATCHES, PathLike, check_suffix, listed
-from epigauge.io._npz import read_npz
+from epigauge.io._npz import read_npz, write_npz
 from epigauge.io._text import Columns, read_text
 from epigauge.io.output import writing
 from epigauge.multi_view.tracks import Reconstruction, Tracks
@@ -204,7 +204,7 @@ def save_tracks(path: PathLike, tracks: Tracks, start: Reconstruction | None = N
     with writing(path) as file:
         if form == ".npz":
             arrays = arrays_of(tracks) | ({} if start is None else {"P": start.P, "Q": start.Q})
-            np.savez_compressed(file, **arrays)
+            write_npz(file, arrays)
         elif form == ".csv":
             _write_csv(file, tracks)
         else:
@@ -232,7 +232,7 @@ def save_reconstruction(path: PathLike, reconstruction: Reconstruction) -> None:
     """
     check_suffix(path, ".npz")
     with writing(path) as file:
-        np.savez_compressed(file, P=reconstruction.P, Q=reconstruction.Q)
+        write_npz(file, {"P": reconstruction.P, "Q": reconstruction.Q})
 
 
 def arrays_of(tracks: Tracks) -> dict[str, Any]:
