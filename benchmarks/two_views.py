@@ -152,7 +152,9 @@ def _status_bytes(name: str) -> int:
 
 def seconds_text(value: float) -> str:
     """Return a time with its unit."""
-    return f"{1e6 * value:.0f} us" if value < 1e-3 else f"{1e3 * value:.3g} ms"
+    if value < 1e-3:
+        return f"{1e6 * value:.0f} us"
+    return f"{1e3 * value:.3g} ms" if value < 1.0 else f"{value:.3g} s"
 
 
 def single_table(found: dict[int, dict[str, dict[str, Any]]], used: dict[str, float]) -> str:

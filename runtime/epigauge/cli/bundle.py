@@ -95,8 +95,9 @@ def bundle(
 ) -> int:
     """Adjust the cameras and points of a file of tracks.
 
-    Starts from two views, registers the others in turn, and minimises the
-    reprojection error in a projective basis. Writes the cameras to stdout, one
+    Starts from two views and registers the others in turn, or from random
+    cameras where that fails, and minimises the reprojection error in a
+    projective basis. Writes the cameras to stdout, one
     line of 12 numbers each, row by row; with --json everything known.
     --plot and -o may be given several times.
 

@@ -9,7 +9,7 @@ import numpy as np
 from epigauge import kernels
 from epigauge.multi_view.adjust import BundleResult
 from epigauge.multi_view.gauge import normalized
-from epigauge.multi_view.initialize import Frame, initialize, intersected
+from epigauge.multi_view.initialize import Frame, initialize
 from epigauge.multi_view.problem import BundleProblem
 from epigauge.multi_view.system import Layout
 from epigauge.multi_view.tracks import Reconstruction, Tracks
@@ -169,5 +169,5 @@ def _random_reconstruction(
     P = random.normal(size=(tracks.n_views, 3, 4))
     q = frame.conditioned(tracks)
     problem = BundleProblem(kernels.table(), layout, q, np.ones(len(tracks)), Loss())
-    Q = intersected(P, problem)
+    Q = problem.engine.intersected(P)
     return Reconstruction(frame.cameras_out(P), problem.triangulated(P, Q))

@@ -1,4 +1,4 @@
-"""Table 4 of B&S: error and processor time on measured image pairs."""
+"""Table 4 of B&S: error and time on measured image pairs."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def table4(study: Study) -> Section:
     )
     times = Table(
         "table4_milliseconds",
-        "Processor time to convergence, LM, ms.",
+        "Time to convergence, LM, ms.",
         ("e", "e'", "pair", *names),
         [
             (*pair.epipoles, pair.name, *[1e3 * loose["LM", name][i].seconds for name in names])
@@ -167,7 +167,7 @@ def table4(study: Study) -> Section:
     }
     by_class = Table(
         "table4_classes",
-        "Median processor time (ms) by class of the outer epipole.",
+        "Median time (ms) by class of the outer epipole.",
         ("damping", "epipoles", "pairs", *names),
         [
             (
@@ -271,7 +271,7 @@ def _claims(
                 "Table 4",
                 f"ORTHO, PARFREE and MAPS cost half as much as FREE and NORM ({label})",
                 min(ratio["FREE"], ratio["NORM"]) >= 1.5 * cheap,
-                "median processor time over ORTHO: "
+                "median time over ORTHO: "
                 + ", ".join(f"{name} {value:.2f}" for name, value in ratio.items()),
             )
         )

@@ -224,7 +224,7 @@ def methods_section(study: Study) -> Section:
             Picture("methods", "Evaluations and success of all methods.", figure),
             table("methods_evaluations", "Mean evaluations of the cost.", counts, ".1f"),
             table("methods_success", "Trials with the lowest error, percent.", reached, ".0f"),
-            table("methods_milliseconds", "Median processor time, ms.", milliseconds, ".2f"),
+            table("methods_milliseconds", "Median time, ms.", milliseconds, ".2f"),
         ],
         [
             Claim(
@@ -245,7 +245,7 @@ def methods_section(study: Study) -> Section:
             ),
             Claim(
                 "not in the paper",
-                "ORTHO eliminated with exact Hessian takes the least processor time",
+                "ORTHO eliminated with exact Hessian takes the least time",
                 bool(cheapest[exact] <= cheapest[others].min()),
                 f"{cheapest[exact]:.2f} ms; BLOCK likewise {cheapest[-1]:.2f} ms; best of the "
                 f"others {cheapest[others].min():.2f} ms "

@@ -1,4 +1,4 @@
-"""Figure 1 of B&S: error and processor time against distance, noise and number of points."""
+"""Figure 1 of B&S: error and time against distance, noise and number of points."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def error_section(study: Study, name: str) -> Section:
 
 
 def time_section(study: Study, name: str) -> Section:
-    """Run one panel of processor time to convergence.
+    """Run one panel of time to convergence.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def time_section(study: Study, name: str) -> Section:
             shown=kind == "evaluations",
         )
         for kind, values, form, caption in (
-            ("milliseconds", median, ".2f", "Median processor time to convergence, ms."),
+            ("milliseconds", median, ".2f", "Median time to convergence, ms."),
             ("evaluations", count, ".1f", "Mean evaluations of the cost to convergence."),
         )
     ]
@@ -182,7 +182,7 @@ def time_section(study: Study, name: str) -> Section:
             Panel(
                 label,
                 sweep.label,
-                "processor time (ms), median",
+                "time (ms), median",
                 sweep.values,
                 dict(zip(names, median[label].T.tolist(), strict=True)),
                 sweep.log + "y",
@@ -201,11 +201,11 @@ def time_section(study: Study, name: str) -> Section:
     cpu = float(np.exp(np.log(median["SEBER"] / median["LM"]).mean()))
     fewer = float(count["SEBER"].mean() / count["LM"].mean())
     return Section(
-        f"Figure 1 ({name[-1]}): processor time against {sweep.label}",
+        f"Figure 1 ({name[-1]}): time against {sweep.label}",
         [
-            "Processor time of the minimisation alone, from its first to its last evaluation; "
+            "Time of the minimisation alone, from its first to its last evaluation; "
             f"median of {study.trials} trials, because the machine is shared.",
-            Picture(name, f"Processor time against {sweep.label}.", figure),
+            Picture(name, f"Time against {sweep.label}.", figure),
             *tables,
         ],
         [
@@ -213,13 +213,13 @@ def time_section(study: Study, name: str) -> Section:
                 f"Fig. 1 ({name[-1]}), 5.1.2",
                 "FREE and NORM cost most, then PARFREE; MAPS and ORTHO least, about the same",
                 bool(min(free, norm) > parfree > max(ortho, maps)),
-                f"processor time over that of ORTHO (LM, geometric mean): {text}",
+                f"time over that of ORTHO (LM, geometric mean): {text}",
             ),
             Claim(
                 f"Fig. 1 ({name[-1]}), 5.1.2",
                 "SEBER costs more than LM",
                 fewer > 1.0,
-                f"SEBER over LM: evaluations {fewer:.2f}, processor time {cpu:.2f}",
+                f"SEBER over LM: evaluations {fewer:.2f}, time {cpu:.2f}",
             ),
         ],
     )
