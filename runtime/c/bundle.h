@@ -22,7 +22,7 @@
    moments holds, so that no vector crosses a cache line, the first eight moments of every factor,
    then the other four of every factor. Each lane has its moments and Q itself in 16 entries. */
 #define EG_MOMENTS 12
-#define EG_SUM(r, e, k) ((k) < 8 ? 8 * (e) + (k) : 8 * (r) + 4 * (e) + (k) - 8)
+#define EG_ENTRY(r, e, k) ((k) < 8 ? 8 * (e) + (k) : 8 * (r) + 4 * (e) + (k) - 8)
 
 /* A camera: sums for the six entries of A and for depth, the gradient, filled up. */
 #define EG_CAMERA 96
@@ -41,7 +41,7 @@ typedef struct {
     const double *weights;
     double least;            /* least weight in the normal equations */
     double scale2;           /* squared scale of the loss */
-    ptrdiff_t loss;          /* 0 linear, 1 huber, 2 soft_l1, 3 cauchy, 4 truncated */
+    ptrdiff_t loss;          /* its number in losses.h */
 } eg_bundle;
 
 /* The lower triangle of the reduced system in blocks of 12x12: block row k holds those from column

@@ -6,6 +6,7 @@
 #include <string.h>
 
 #include "bundle.h"
+#include "losses.h"
 
 typedef struct {
     ptrdiff_t M, L;
@@ -99,15 +100,10 @@ static inline void eg_weigh(const eg_bundle *b, ptrdiff_t M, ptrdiff_t filled,
 {
     const double least = b->least;
     const double *first = 0;
-    switch (b->loss) {
-    case 1: eg_loss_huber(M, squared, &b->scale2, work, work + M, work + 2 * M); break;
-    case 2: eg_loss_soft_l1(M, squared, &b->scale2, work, work + M, work + 2 * M); break;
-    case 3: eg_loss_cauchy(M, squared, &b->scale2, work, work + M, work + 2 * M); break;
-    case 4: eg_loss_truncated(M, squared, &b->scale2, work, work + M, work + 2 * M); break;
-    default: break;
-    }
-    if (b->loss)
+    if (b->loss != EG_LINEAR) {
+        eg_losses((int)b->loss, b->scale2, M, squared, work, work + M, work + 2 * M);
         first = work + M;
+    }
     for (ptrdiff_t j = 0; j < filled; ++j) {
         const double value = first ? weights[j] * first[j] : weights[j];
         w[j] = value < least ? least : value;
@@ -121,7 +117,7 @@ static inline void eg_charge(const eg_bundle *b, ptrdiff_t M, const double *EG_R
                              const double *EG_RESTRICT squared, const double *EG_RESTRICT work,
                              double *EG_RESTRICT costs)
 {
-    const double *rho = b->loss ? work : squared;
+    const double *rho = b->loss != EG_LINEAR ? work : squared;
     EG_SIMD
     for (ptrdiff_t j = 0; j < M; ++j)
         costs[j] += weights[j] * rho[j];
@@ -132,7 +128,7 @@ static inline void eg_weigh_at(const eg_bundle *b, ptrdiff_t M, ptrdiff_t filled
                                const double *Q, const double *q, const double *weights,
                                double *squared, double *work, double *w)
 {
-    if (b->loss)
+    if (b->loss != EG_LINEAR)
         eg_squared_distance(M, P, Q, q, squared);
     eg_weigh(b, M, filled, weights, squared, work, w);
 }

@@ -25,10 +25,10 @@ void eg_bundle_camera_blocks(
                 for (int b = 0; b < 3; ++b)
                     for (int l = 0; l < 4; ++l)
                         own[ROWS * (4 * a + k) + 4 * b + l] =
-                            sum[EG_SUM(7, upper_of[a][b], moment_of[k][l])];
+                            sum[EG_ENTRY(7, upper_of[a][b], moment_of[k][l])];
         for (int k = 0; k < 4; ++k)
             for (int l = 0; l < 4; ++l)
-                depth[ROWS * (8 + k) + 8 + l] = sum[EG_SUM(7, 6, moment_of[k][l])];
+                depth[ROWS * (8 + k) + 8 + l] = sum[EG_ENTRY(7, 6, moment_of[k][l])];
         memcpy(g + ROWS * i, sum + 7 * EG_MOMENTS, ROWS * sizeof(double));
     }
 }
@@ -149,7 +149,7 @@ void eg_bundle_reduce(
                     for (int p = 0; p < 3; ++p)
                         for (int k = 0; k < 4; ++k)
                             to[ROWS * (4 * q + l) + 4 * p + k] =
-                                -pair[EG_SUM(9, 3 * q + p, moment_of[k][l])];
+                                -pair[EG_ENTRY(9, 3 * q + p, moment_of[k][l])];
             if (A) { /* half = (sums) A, row by row; S = -A^T half. */
                 memset(half, 0, sizeof half);
                 memset(S, 0, sizeof half);

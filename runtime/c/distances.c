@@ -16,16 +16,6 @@ typedef struct {
     double R1[4], R2[4], s[2], b1[2], b2[2], f[1];
 } frame_t;
 
-static ptrdiff_t least(ptrdiff_t a, ptrdiff_t b)
-{
-    return a < b ? a : b;
-}
-
-double *eg_block_points(const eg_matches *matches, ptrdiff_t begin)
-{
-    return matches->q + 4 * begin;
-}
-
 static frame_t frame_of(const double *F)
 {
     frame_t frame;
@@ -80,37 +70,12 @@ static void block_distances(const eg_matches *matches, const eg_options *options
         squared[i] = d[i] * d[i];
 }
 
-void eg_losses(int loss, double scale2, ptrdiff_t n, const double *squared, double *value,
-               double *first, double *second)
-{
-    switch (loss) {
-    case EG_HUBER:
-        eg_loss_huber(n, squared, &scale2, value, first, second);
-        break;
-    case EG_SOFT_L1:
-        eg_loss_soft_l1(n, squared, &scale2, value, first, second);
-        break;
-    case EG_CAUCHY:
-        eg_loss_cauchy(n, squared, &scale2, value, first, second);
-        break;
-    case EG_TRUNCATED:
-        eg_loss_truncated(n, squared, &scale2, value, first, second);
-        break;
-    default:
-        for (ptrdiff_t i = 0; i < n; ++i) {
-            value[i] = squared[i];
-            first[i] = 1.0;
-            second[i] = 0.0;
-        }
-    }
-}
-
 double eg_distances(eg_matches *matches, const eg_options *options, const double *F)
 {
     double squared[EG_BLOCK], value[EG_BLOCK], first[EG_BLOCK], second[EG_BLOCK], sum = 0.0;
     const frame_t frame = frame_of(F);
     for (ptrdiff_t begin = 0; begin < matches->m; begin += EG_BLOCK) {
-        const ptrdiff_t n = least(EG_BLOCK, matches->m - begin);
+        const ptrdiff_t n = eg_block_size(matches, begin);
         const double *weights = matches->weights + begin;
         double part = 0.0;
         block_distances(matches, options, F, &frame, begin, n, squared);
@@ -175,7 +140,7 @@ static int sums(eg_matches *matches, const eg_options *options, const double *F,
     memset(N, 0, PACKED * sizeof(double));
     memset(H, 0, PACKED * sizeof(double));
     for (ptrdiff_t begin = 0; begin < matches->m; begin += EG_BLOCK) {
-        const ptrdiff_t n = least(EG_BLOCK, matches->m - begin);
+        const ptrdiff_t n = eg_block_size(matches, begin);
         const double *q1 = eg_block_points(matches, begin), *q2 = q1 + 2 * n;
         const double *l = matches->multiplier + begin;
         block_weights(matches, options, begin, n, weight, curvature);

@@ -28,11 +28,6 @@ typedef struct {
     double o1[2], o2[2], scale;
 } conditioning_t;
 
-static ptrdiff_t least(ptrdiff_t a, ptrdiff_t b)
-{
-    return a < b ? a : b;
-}
-
 static int counts(const double *weights, ptrdiff_t i)
 {
     return !weights || weights[i] > 0.0;
@@ -200,8 +195,8 @@ static void fill(eg_matches *matches, const conditioning_t *c, const double *x1,
                  const double *weights)
 {
     for (ptrdiff_t begin = 0; begin < matches->m; begin += EG_BLOCK) {
-        const ptrdiff_t n = least(EG_BLOCK, matches->m - begin);
-        double *q = matches->q + 4 * begin;
+        const ptrdiff_t n = eg_block_size(matches, begin);
+        double *q = eg_block_points(matches, begin);
         for (ptrdiff_t i = 0; i < n; ++i) {
             const double *first = x1 + 2 * (begin + i), *second = x2 + 2 * (begin + i);
             q[i] = (first[0] - c->o1[0]) / c->scale;
@@ -330,8 +325,8 @@ EG_EXPORT int eg_minimize_matches(ptrdiff_t m, const double *q1, const double *q
     if (!matches.q)
         return 0;
     for (ptrdiff_t begin = 0; begin < m; begin += EG_BLOCK) {
-        const ptrdiff_t n = least(EG_BLOCK, m - begin);
-        double *q = matches.q + 4 * begin;
+        const ptrdiff_t n = eg_block_size(&matches, begin);
+        double *q = eg_block_points(&matches, begin);
         for (int k = 0; k < 2; ++k) {
             memcpy(q + k * n, q1 + k * m + begin, (size_t)n * sizeof(double));
             memcpy(q + (2 + k) * n, q2 + k * m + begin, (size_t)n * sizeof(double));

@@ -1,8 +1,8 @@
 /* Which of the libraries built from these sources the processor can run. */
-#include "epigauge_native.h"
+#include "epigauge_kernels.h"
 
 /* Level of the x86-64 psABI: 4 with AVX-512, 3 with AVX2 and FMA, else 0. */
-int eg_processor_level(void)
+EG_EXPORT int eg_processor_level(void)
 {
 #if defined(__GNUC__) && defined(__x86_64__)
     __builtin_cpu_init();

@@ -5,7 +5,7 @@
 #ifndef EPIGAUGE_TWO_VIEW_H
 #define EPIGAUGE_TWO_VIEW_H
 
-#include "epigauge_kernels.h"
+#include "losses.h"
 
 /* Matches are kept and worked on in blocks, so that all between two passes stays in the cache. */
 #define EG_BLOCK 256
@@ -18,10 +18,9 @@
 #define EG_SUM(...) EG_PRAGMA(omp simd reduction(+ : __VA_ARGS__))
 #endif
 
-/* Numbers of the choices, as _native.py has them. */
+/* Numbers of the choices, as native.py has them. */
 enum { EG_REPROJECTION, EG_SAMPSON, EG_EPIPOLAR };
 enum { EG_ORTHO, EG_BLOCKS };
-enum { EG_LINEAR, EG_HUBER, EG_SOFT_L1, EG_CAUCHY, EG_TRUNCATED };
 
 typedef struct {
     int criterion, chart, loss;
@@ -40,6 +39,17 @@ typedef struct {
     double *multiplier; /* m */
     double *d;          /* m: signed distances */
 } eg_matches;
+
+/* The points of the block that begins at a match, and how many matches it has. */
+static inline double *eg_block_points(const eg_matches *matches, ptrdiff_t begin)
+{
+    return matches->q + 4 * begin;
+}
+
+static inline ptrdiff_t eg_block_size(const eg_matches *matches, ptrdiff_t begin)
+{
+    return matches->m - begin < EG_BLOCK ? matches->m - begin : EG_BLOCK;
+}
 
 /* A representation of F: U, V and sigma, or U, V and a 2x2 matrix. */
 #define EG_MOTION 22
@@ -62,12 +72,6 @@ typedef struct {
 
 /* iteration, cost, lambda, length of the step, accepted, seconds */
 #define EG_ROW 6
-
-/* Loss of squared residuals with its first two derivatives. */
-void eg_losses(int loss, double scale2, ptrdiff_t n, const double *squared, double *value,
-               double *first, double *second);
-
-double *eg_block_points(const eg_matches *matches, ptrdiff_t begin);
 
 /* Signed distances into matches->d (and multipliers); returns half the weighted robust sum. */
 double eg_distances(eg_matches *matches, const eg_options *options, const double *F);

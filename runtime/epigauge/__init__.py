@@ -1,8 +1,10 @@
-"""Geometry of uncalibrated images: maximum-likelihood fundamental matrices and their uncertainty.
+"""Geometry of uncalibrated images: maximum-likelihood fundamental matrices and reconstructions.
 
 >>> import epigauge as eg
 >>> result = eg.refine_fundamental(x1, x2)  # doctest: +SKIP
 >>> result.F, result.rms_px, result.covariance  # doctest: +SKIP
+>>> bundle = eg.bundle_adjust(eg.load_tracks("tracks.csv"))  # doctest: +SKIP
+>>> bundle.reconstruction, bundle.rms_px  # doctest: +SKIP
 """
 
 from typing import TYPE_CHECKING

@@ -316,7 +316,7 @@ def as_weights(weights: ArrayLike, m: int) -> Array:
 
     Returns
     -------
-    ndarray, shape (m,), float64
+    ndarray, shape (m,), float64, contiguous
         Weights that may share memory with the input: do not write into them.
 
     Raises
@@ -334,7 +334,7 @@ def as_weights(weights: ArrayLike, m: int) -> Array:
         raise ArgumentError("weights", f"has {w[bad[0]]} in row {bad[0]}", needed)
     if m and not w.any():
         raise ArgumentError("weights", "is zero for every match", "some positive weights")
-    return w
+    return np.ascontiguousarray(w)
 
 
 def as_covariances(name: str, value: ArrayLike, m: int) -> Array:

@@ -10,18 +10,22 @@ import ctypes
 import os
 from functools import cache
 from importlib import resources
+from typing import Any
 
 from epigauge_generated.signatures import C_DIGEST
 
 from epigauge.errors import ArgumentError, BackendError
 
-__all__ = ["LEVELS", "library", "usable", "variant"]
+__all__ = ["LEVELS", "address", "library", "usable", "variant"]
 
 #: Names of the variants by the level of the x86-64 ABI they need, the fastest first.
 LEVELS = {4: "x86-64-v4", 3: "x86-64-v3", 0: "baseline"}
 
 #: Names one of them instead of the fastest that the processor can run.
 CHOICE = "EPIGAUGE_PROCESSOR"
+
+
+_byte = ctypes.c_char.from_buffer
 
 
 @cache
@@ -41,6 +45,16 @@ def library() -> ctypes.CDLL:
         If the environment variable EPIGAUGE_PROCESSOR asks for a variant that there is not.
     """
     return _choose()[1]
+
+
+def address(array: Any) -> int | None:
+    """Return the address of a contiguous array, None of None; keep the array while it is used."""
+    if array is None:
+        return None
+    try:  # twice as fast as what NumPy offers, but for writable arrays only
+        return ctypes.addressof(_byte(array))
+    except (TypeError, ValueError):
+        return int(array.__array_interface__["data"][0])
 
 
 def variant() -> str:

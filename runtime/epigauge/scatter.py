@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge._library import address
 from epigauge.kernels import backend
-from epigauge.multi_view._native import address, function
+from epigauge.multi_view._native import function
 
 __all__ = ["scatter_constraints", "spread", "spreading_basis"]
 

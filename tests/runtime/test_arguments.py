@@ -237,6 +237,13 @@ def test_weights_keep_their_values() -> None:
     np.testing.assert_array_equal(as_weights([0, 1, 2], 3), [0.0, 1.0, 2.0])
 
 
+def test_weights_are_contiguous() -> None:
+    for values in (np.arange(6.0)[::2], np.arange(3.0)[::-1], np.ones((3, 2))[:, 1]):
+        w = as_weights(values, 3)
+        np.testing.assert_array_equal(w, values)
+        assert w.flags.c_contiguous
+
+
 @given(st.text(max_size=200) | st.binary(max_size=50) | st.lists(st.integers()) | st.none())
 def test_any_value_is_refused_with_a_short_message(value) -> None:
     for check in (as_positive, as_count):

@@ -68,6 +68,14 @@ def test_progress_counts_to_the_number_of_pairs(ragged):
     assert calls == [(k + 1, len(SIZES)) for k in range(len(SIZES))]
 
 
+def test_a_callback_hears_of_the_given_pairs_only(ragged):
+    x1, x2, offsets = ragged
+    rows = []
+    batch = eg.refine_fundamental_batch(x1, x2, offsets, callback=rows.append)
+    assert len(rows) == batch.nfev.sum()
+    assert sum(row.iteration == 0 for row in rows) == batch.success.sum()
+
+
 def test_an_empty_batch_is_legal():
     batch = eg.refine_fundamental_batch(np.zeros((0, 2)), np.zeros((0, 2)), [0])
     assert len(batch) == 0

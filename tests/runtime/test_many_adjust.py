@@ -349,6 +349,19 @@ class TestWeights:
         on = ~off
         assert a.cost == pytest.approx(0.5 * np.sum(a.fun[on] ** 2), rel=1e-9)
 
+    def test_weight_zero_does_not_count_for_the_scale_of_the_loss(
+        self, truth: eg.Reconstruction
+    ) -> None:
+        tracks = many_views.observed(truth)
+        on = np.random.default_rng(0).uniform(size=len(tracks)) < 0.4
+        scales = []
+        for error in (0.0, 20.0):
+            xy = tracks.xy + np.where(on, 0.0, error)[:, None]
+            given = eg.Tracks(tracks.view, tracks.point, xy, weights=1.0 * on)
+            found = eg.bundle_adjust(given, truth, loss="cauchy", max_iter=1)
+            scales.append(found.loss_scale_px)
+        assert scales[0] == scales[1]
+
 
 @pytest.mark.slow
 def test_memory_of_a_long_sequence_stays_bounded(data_dir: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -12,14 +14,15 @@ import many_views
 import numpy as np
 import pytest
 from epigauge import kernels, scatter
+from epigauge.multi_view import adjust, packing
 from epigauge.multi_view import coupling as coupling_module
 from epigauge.multi_view import envelope as envelope_module
-from epigauge.multi_view import packing
 from epigauge.multi_view.coupling import StoredCoupling, conjugate_gradients
 from epigauge.multi_view.dampings import Covariant
 from epigauge.multi_view.engine import Normal, Reference, Triangulation
 from epigauge.multi_view.envelope import Envelope, narrow
 from epigauge.multi_view.fused import Fused
+from epigauge.multi_view.layout import Layout
 from epigauge.multi_view.problem import BundleProblem, Linearized
 from epigauge.multi_view.resection import resect
 from epigauge.multi_view.strategies import STRATEGIES
@@ -246,6 +249,7 @@ class TestEnvelope:
     def test_cameras_in_any_order_give_the_same_steps(
         self, workers: int, monkeypatch: pytest.MonkeyPatch
     ) -> None:
+        monkeypatch.setattr(packing, "_SHARE", 1.0)
         # A sequence whose views are numbered at random, with few of them together.
         rng = np.random.default_rng(1)
         n, m = 60, 800
@@ -411,6 +415,10 @@ class TestHostileInput:
 
 
 class TestThreads:
+    @pytest.fixture(autouse=True)
+    def _small_problems_are_shared_too(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(packing, "_SHARE", 1.0)
+
     @pytest.mark.parametrize("workers", [2, 3, 64])
     def test_parts_are_the_same_to_rounding(self, workers: int) -> None:
         problem, (P, Q) = problem_and_estimate(6, 500, 0.5, loss="huber")
@@ -430,10 +438,60 @@ class TestThreads:
         problem, _ = problem_and_estimate(12, 300, 0.3)
         packed = packing.Packed(problem.layout, problem.q, problem.weights)
         for workers in (1, 2, 5, 1000):
-            shares = packed.shares(workers)
-            assert [begin for begin, _ in shares] == [0, *(end for _, end in shares[:-1])]
-            assert shares[-1][1] == len(packed.lanes) - 1
-            assert len(shares) <= workers
+            for shares in packed.shares(workers):
+                assert [begin for begin, _ in shares] == [0, *(end for _, end in shares[:-1])]
+                assert shares[-1][1] == len(packed.lanes) - 1
+                assert len(shares) <= workers
+
+    def test_little_work_is_not_shared(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        problem, _ = problem_and_estimate(5, 100, 1.0)
+        packed = packing.Packed(problem.layout, problem.q, problem.weights)
+        assert [len(shares) for shares in packed.shares(2)] == [2, 2]
+        monkeypatch.undo()
+        whole = [(0, len(packed.lanes) - 1)]
+        assert packed.shares(2) == packed.shares(64) == (whole, whole)
+
+    def test_two_chunks_are_shared_by_two(self) -> None:
+        problem, _ = problem_and_estimate(3, 112, 1.0)
+        packed = packing.Packed(problem.layout, problem.q, problem.weights)
+        assert packed.shares(2) == ([(0, 1), (1, 2)], [(0, 1), (1, 2)])
+
+    def test_shares_are_of_equal_work_for_the_pass_they_are_for(self) -> None:
+        # Half of the observations in long tracks: these have most of the pairs.
+        lengths = np.repeat([20, 2], [100, 1000])
+        first = np.concatenate([[0], np.cumsum(lengths)])
+        point = np.repeat(np.arange(len(lengths)), lengths)
+        layout = Layout(np.arange(len(point)) - first[point], point, 20, len(lengths))
+        packed = packing.Packed(layout, np.zeros((2, len(point))), np.ones(len(point)))
+        passes, pairs = packed.shares(2)
+        rows, slots = np.diff(packed.rows), np.diff(packed.rows) // np.diff(packed.lanes)
+        by_rows = [rows[slice(*own)].sum() for own in passes]
+        by_pairs = [(rows * slots)[slice(*own)].sum() for own in pairs]
+        assert by_rows[0] > 1.2 * by_rows[1]  # points cost something, too
+        assert max(by_pairs) < 3.0 * min(by_pairs)
+        assert pairs[0][1] < passes[0][1]
+
+    def test_no_pass_outlives_the_call_that_waits_for_it(self) -> None:
+        problem, _ = problem_and_estimate(6, 500, 0.5)
+        ended: list[int] = []
+
+        def interrupted(k: int, *_: int) -> int:
+            if k == 0:
+                raise KeyboardInterrupt
+            time.sleep(0.2)
+            ended.append(k)
+            return 0
+
+        with pytest.raises(KeyboardInterrupt):
+            engines(problem, 2)[0]._share([(0, 1), (1, 2)], interrupted)
+        assert ended == [1]
+
+    def test_threads_end_with_the_problem(self, scene: Any) -> None:
+        before = set(threading.enumerate())
+        eg.bundle_adjust(*scene, workers=2)
+        for thread in set(threading.enumerate()) - before:
+            thread.join(5.0)
+            assert not thread.is_alive()
 
     def test_runs_are_deterministic_for_a_number_of_workers(self, scene: Any) -> None:
         tracks = many_views.observed(many_views.cameras_and_points(5, 400))
@@ -460,6 +518,13 @@ class TestThreads:
     def test_bad_numbers_are_refused(self, scene: Any, workers: Any) -> None:
         with pytest.raises(ValueError, match="workers"):
             eg.bundle_adjust(*scene, workers=workers)
+
+    def test_bad_numbers_are_refused_before_the_work(
+        self, scene: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(adjust, "initialize", pytest.fail)
+        with pytest.raises(ValueError, match="workers"):
+            eg.bundle_adjust(scene[0], workers=0)
 
 
 def test_neither_jacobians_nor_couplings_are_stored() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import epigauge as eg
 import many_views
@@ -15,6 +17,9 @@ from epigauge.multi_view.initialize import Frame
 from epigauge.multi_view.resection import resect
 from epigauge.two_view.losses import Loss
 from laws import distance
+
+# The package has a function of the same name.
+initialize_module = import_module("epigauge.multi_view.initialize")
 
 
 def median_residual(tracks: eg.Tracks, found: eg.Reconstruction, rows: np.ndarray) -> float:
@@ -78,6 +83,31 @@ def test_the_backends_start_alike(backend: str) -> None:
     found = eg.initialize(tracks, backend=backend)
     # Where a camera's iteration ends, within 1e-6 of its cost, rounding may decide.
     assert distance(found.project(tracks), expected.project(tracks)) < 1e-4
+
+
+@pytest.mark.parametrize("name", ["numpy", "casadi"])
+def test_two_views_begin_with_the_backend_asked_for(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    many_views.need_backend(name)
+    asked: list[str | None] = []
+
+    def refine(*arguments: Any, backend: str | None = None, **options: Any) -> Any:
+        asked.append(backend)
+        return eg.refine_fundamental(*arguments, backend=backend, **options)
+
+    monkeypatch.setattr(initialize_module, "refine_fundamental", refine)
+    eg.initialize(many_views.observed(many_views.cameras_and_points(3, 20)), backend=name)
+    assert asked == [name]
+
+
+def test_points_on_one_line_are_told_in_the_callers_words() -> None:
+    view, point = np.divmod(np.arange(48), 12)
+    s = np.random.default_rng(0).uniform(0.0, 100.0, 12)[point]
+    xy = np.column_stack([s, 2.0 * s + view])
+    with pytest.raises(ArgumentError, match=r"views \d and \d.*on one line") as caught:
+        eg.initialize(eg.Tracks(view, point, xy))
+    assert caught.value.argument == "tracks"
 
 
 def test_views_with_too_few_common_points_are_named() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import epigauge as eg
@@ -11,12 +12,15 @@ import many_views
 import numpy as np
 import pytest
 from epigauge import kernels, lm
-from epigauge.multi_view.factorization import FactorizationProblem, _OnCameras
+from epigauge.multi_view.factorization import FactorizationProblem, _OnCameras, _trust
 from epigauge.multi_view.far import FAR, JumpingProblem
 from epigauge.multi_view.gauge import normalized
 from epigauge.multi_view.initialize import Frame
 from epigauge.multi_view.system import Layout
 from laws import assert_jacobian, distance
+
+# The package has a function of the same name.
+initialize_module = import_module("epigauge.multi_view.initialize")
 
 #: Published optima (Hong et al., ECCV 2016, Table 7), RMS a coordinate in pixels.
 OPTIMA = {
@@ -172,6 +176,22 @@ def test_sparse_tracks_with_gross_errors_need_no_start(share: float, seed: int) 
     # One pixel of noise: 1.18 is the median of its length, less what the points take up.
     assert median(eg.initialize(tracks)) < 1.5
     assert median(eg.initialize(tracks, method="registration")) > 5.0
+
+
+def test_weight_zero_does_not_tell_whether_a_start_is_good() -> None:
+    truth = many_views.cameras_and_points()
+    clean = many_views.observed(truth)
+    on = np.random.default_rng(0).uniform(size=len(clean)) < 0.4
+    xy = clean.xy + np.where(on, 0.0, 500.0)[:, None]
+    tracks = eg.Tracks(clean.view, clean.point, xy, weights=1.0 * on)
+    assert initialize_module._median_residual(tracks, truth) < 2.0
+
+
+def test_weight_zero_does_not_count_for_the_trust_in_others() -> None:
+    rng = np.random.default_rng(0)
+    near, on = np.abs(rng.normal(size=100)), rng.uniform(size=100) < 0.4
+    trusts = [_trust(np.where(on, near, far), on)[on] for far in (near, 1e6)]
+    np.testing.assert_array_equal(*trusts)
 
 
 # ---------------------------------------------------------------- far starts

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import many_views
 import numpy as np
@@ -103,6 +104,16 @@ def test_border_is_solved_by_woodbury(small: tuple) -> None:
     assert distance(bordered.solve() / size, expected / size) < 1e-9
     step = rng.standard_normal(system.gradient.size)
     assert distance(bordered.product(step), N @ step) < 1e-12
+
+
+@pytest.mark.parametrize("entry", [2.0, np.nan])
+def test_conjugate_gradients_tell_of_a_system_that_is_not_definite(entry: float) -> None:
+    S = np.array([[1.0, entry], [entry, 1.0]])
+    reduced = SimpleNamespace(
+        diagonal=lambda: np.ones((2, 1, 1)), times=lambda x: (S @ x.ravel()).reshape(x.shape)
+    )
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        coupling_module.conjugate_gradients(reduced, np.array([[1.0], [-1.0]]))
 
 
 def test_conjugate_gradients_give_the_same_solution(

@@ -173,6 +173,20 @@ def test_start_value_allows_fewer_than_eight_matches_of_weight() -> None:
     assert result.cost < 0.1 * 0.5 * np.sum(w * d**2)
 
 
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"loss": "huber"}, {"parameterization": "block"}, {"structure": "joint"}, {"starts": 2}],
+    ids=str,
+)
+def test_weights_may_lie_anywhere_in_memory(options) -> None:
+    w = np.random.default_rng(0).uniform(0.1, 5.0, (50, 3))
+    for weights in (w[:, 1], w[::-1, 2]):
+        strided = eg.refine_fundamental(X1, X2, weights=weights, **options)
+        packed = eg.refine_fundamental(X1, X2, weights=weights.copy(), **options)
+        assert strided.cost == packed.cost
+        np.testing.assert_array_equal(strided.F, packed.F)
+
+
 class TestGeometry:
     @pytest.mark.parametrize("function", [eg.reprojection_distances, eg.sampson_distances])
     @pytest.mark.parametrize(

@@ -10,15 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge._library import library
+from epigauge._library import address, library
 
 __all__ = [
     "CAMERA",
     "LANES",
-    "LOSSES",
     "PAIR",
     "Bundle",
-    "address",
     "aligned_zeros",
     "checked",
     "function",
@@ -28,7 +26,6 @@ Array = NDArray[np.float64]
 
 #: As in bundle.h.
 LANES, CAMERA, PAIR = 8, 96, 112
-LOSSES = ("linear", "huber", "soft_l1", "cauchy", "truncated")
 
 _P, _N, _D, _I = ctypes.c_void_p, ctypes.c_ssize_t, ctypes.c_double, ctypes.c_int
 
@@ -77,9 +74,6 @@ _TYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "envelope_solve": (None, (_P, _P, _N, _P)),
 }
 
-_byte = ctypes.c_char.from_buffer
-_address = ctypes.addressof
-
 
 @cache
 def function(name: str) -> Any:
@@ -87,16 +81,6 @@ def function(name: str) -> Any:
     found = getattr(library(), f"eg_{name}")
     found.restype, found.argtypes = _TYPES[name]
     return found
-
-
-def address(array: Any) -> int | None:
-    """Return the address of a contiguous array, None of None; keep the array while it is used."""
-    if array is None:
-        return None
-    try:  # twice as fast as what NumPy offers, but for writable arrays only
-        return _address(_byte(array))
-    except (TypeError, ValueError):
-        return int(array.__array_interface__["data"][0])
 
 
 def checked(status: int) -> None:

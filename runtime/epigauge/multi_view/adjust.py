@@ -109,7 +109,8 @@ def bundle_adjust(
     method : str
         Strategy: "covariant" (default) gives the same iterations in every basis; "free",
         "hartley", "bartoli", "faugeras", "mclauchlan", "kanatani" and "gauge_invariant" are those
-        of B03; "levenberg" and "marquardt" leave everything free.
+        of B03, "gauge_invariant_factor" is the other reading of its Table 1; "levenberg" and
+        "marquardt" leave everything free.
     gauge : Gauge, optional
         For methods that leave everything free: a gauge to iterate in, such as
         ``eg.gauge.normalized()``; without the parentheses it takes its defaults.
@@ -132,8 +133,8 @@ def bundle_adjust(
     max_iter : int
         Trial steps allowed.
     workers : int
-        Threads that share the points, with the back end "c". The same number gives the same result
-        to the last bit; others differ by rounding.
+        Most threads that share the points, with the back end "c"; small problems take fewer. The
+        same number gives the same result to the last bit; others differ by rounding.
     backend : {"c", "numpy", "casadi"}, optional
         Where the formulas are computed.
     callback : callable, optional
@@ -187,6 +188,7 @@ def bundle_adjust(
             raise ArgumentError(
                 "gauge_mode", "is 'implicit' with a damping that adds no matrix", "'explicit'"
             )
+    workers = as_count("workers", workers)
     stopping = lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter)
     table = kernels.table(backend)
     if start is None:
@@ -207,7 +209,7 @@ def bundle_adjust(
         np.asarray(tracks.weights),
         Loss(loss, scale_px / frame.scale),
         embedded and strategy.embedded and damping in (None, "covariant"),
-        as_count("workers", workers),
+        workers,
     )
     P, Q = frame.cameras_in(start.P), start.Q
     explicit = strategy.gauge if strategy.explicit else gauge
@@ -283,4 +285,4 @@ def _loss_scale(
     if loss_scale_px != "auto":
         return as_positive("loss_scale_px", loss_scale_px)
     distances = np.linalg.norm(tracks.xy - start.project(tracks), axis=1)
-    return EFFICIENT[loss] * max(robust_scale(distances), 1e-12)
+    return EFFICIENT[loss] * max(robust_scale(distances[tracks.weights > 0.0]), 1e-12)

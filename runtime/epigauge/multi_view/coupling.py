@@ -201,6 +201,11 @@ def conjugate_gradients(reduced: Reduced, right: Array) -> Array:
     -------
     ndarray, shape (n, a)
         S^-1 right, to a relative 1e-10 in the norm of the preconditioned residual.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If S is seen not to be positive definite, or is not finite.
     """
     inverse = np.linalg.inv(reduced.diagonal())
     x = np.zeros_like(right)
@@ -212,7 +217,10 @@ def conjugate_gradients(reduced: Reduced, right: Array) -> Array:
         if energy <= goal:
             break
         image = reduced.times(direction)
-        length = energy / float(np.sum(direction * image))
+        curvature = float(np.sum(direction * image))
+        if not curvature > 0.0:
+            raise np.linalg.LinAlgError("the reduced system is not positive definite")
+        length = energy / curvature
         x = x + length * direction
         residual = residual - length * image
         z = np.einsum("nij,nj->ni", inverse, residual)

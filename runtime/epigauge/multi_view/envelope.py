@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.multi_view._native import address, function
+from epigauge._library import address
+from epigauge.multi_view._native import function
 
 __all__ = ["Envelope", "narrow"]
 

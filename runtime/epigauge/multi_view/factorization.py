@@ -207,7 +207,7 @@ def factorized(
     P[:, 2] = 0.0, 0.0, 0.0, 1.0
     unit, distances = typical_block(layout), np.zeros(len(layout.view))
     for stage in _ROBUST if robust else _PLAIN:
-        trusted = weights * _trust(distances) if stage.reweighted else weights
+        trusted = weights * _trust(distances, weights > 0.0) if stage.reweighted else weights
         ridge = stage.ridge * unit
         problem = FactorizationProblem(kernels, layout, q, trusted, stage.eta, ridge)
         stopping = lm.Stopping(ftol=stage.ftol, xtol=0.0, gtol=0.0, max_iter=_MAX_ITER)
@@ -216,7 +216,7 @@ def factorized(
     return P, np.column_stack([state.X, np.ones(layout.n_points)])
 
 
-def _trust(distances: Array) -> Array:
+def _trust(distances: Array, counts: NDArray[np.bool_]) -> Array:
     """Return the weights of Geman and McClure, by distances in robust standard deviations."""
-    scale = _DOUBTFUL * max(robust_scale(distances), 1e-12)
+    scale = _DOUBTFUL * max(robust_scale(distances[counts]), 1e-12)
     return np.asarray(1.0 / (1.0 + (distances / scale) ** 2) ** 2)

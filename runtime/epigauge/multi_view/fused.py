@@ -10,20 +10,21 @@ from __future__ import annotations
 import copy
 import ctypes
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.multi_view._native import CAMERA, address, aligned_zeros, checked, function
+from epigauge._library import address
+from epigauge.multi_view._native import CAMERA, aligned_zeros, checked, function
 from epigauge.multi_view.coupling import most_blocks
 from epigauge.multi_view.engine import Normal, Triangulation
 from epigauge.multi_view.envelope import Envelope
 from epigauge.multi_view.fused_coupling import FusedCoupling
 from epigauge.multi_view.layout import Layout
-from epigauge.multi_view.packing import Packed
+from epigauge.multi_view.packing import Packed, Range
 from epigauge.two_view.losses import Loss
 
 __all__ = ["Fused"]
@@ -60,8 +61,10 @@ class Fused:
         self._packed = Packed(layout, q, weights)
         self._bundle = self._packed.bundle(loss)
         self.reference = ctypes.byref(self._bundle)
-        self._ranges = self._packed.shares(workers)
-        self._pool = ThreadPoolExecutor(len(self._ranges)) if len(self._ranges) > 1 else None
+        self._passes, self._pairs = self._packed.shares(workers)
+        # The calling thread has the first share.
+        others = max(len(self._passes), len(self._pairs)) - 1
+        self._pool = ThreadPoolExecutor(others) if others else None
 
     @property
     def envelope(self) -> Envelope:
@@ -106,14 +109,22 @@ class Fused:
     def each(self, name: str, *arguments: Any) -> None:
         """Call a C function for all chunks, which write to places of their own."""
         call = function(name)
-        self._share(lambda _, begin, end: call(self.reference, begin, end, *arguments))
-
-    def summed(self, name: str, before: tuple[Any, ...], *shapes: tuple[int, ...]) -> list[Array]:
-        """Call a C function for all chunks, which add to its last arguments, arrays of `shapes`."""
-        call = function(name)
-        sums = [[aligned_zeros(shape) for shape in shapes] for _ in self._ranges]
         self._share(
-            lambda k, begin, end: call(self.reference, begin, end, *before, *map(address, sums[k]))
+            self._passes, lambda _, begin, end: call(self.reference, begin, end, *arguments)
+        )
+
+    def summed(
+        self, name: str, before: tuple[Any, ...], *shapes: tuple[int, ...], pairs: bool = False
+    ) -> list[Array]:
+        """Call a C function for all chunks, which add to its last arguments, arrays of `shapes`.
+
+        `pairs` tells that it works on pairs of observations.
+        """
+        call, ranges = function(name), self._pairs if pairs else self._passes
+        sums = [[aligned_zeros(shape) for shape in shapes] for _ in ranges]
+        self._share(
+            ranges,
+            lambda k, begin, end: call(self.reference, begin, end, *before, *map(address, sums[k])),
         )
         for others in sums[1:]:
             for total, other in zip(sums[0], others, strict=True):
@@ -122,21 +133,24 @@ class Fused:
 
     def over_points(self, call: Callable[[slice], Any]) -> list[Any]:
         """Call a function with as many ranges of points as there are workers."""
-        if self._pool is None:
-            return [call(slice(0, self.layout.n_points))]
-        count = len(self._ranges)
-        edges = [self.layout.n_points * k // count for k in range(count + 1)]
+        count, m = len(self._passes), self.layout.n_points
+        edges = [m * k // count for k in range(count + 1)]
         parts = [slice(begin, end) for begin, end in zip(edges[:-1], edges[1:], strict=True)]
-        pending = [self._pool.submit(call, part) for part in parts]
-        return [future.result() for future in pending]
+        return self._together([partial(call, part) for part in parts])
 
-    def _share(self, call: Callable[[int, int, int], int]) -> None:
-        if self._pool is None:
-            checked(call(0, *self._ranges[0]))
-            return
-        pending = [self._pool.submit(call, k, *own) for k, own in enumerate(self._ranges)]
-        for status in [future.result() for future in pending]:
+    def _share(self, ranges: list[Range], call: Callable[[int, int, int], int]) -> None:
+        for status in self._together([partial(call, k, *own) for k, own in enumerate(ranges)]):
             checked(status)
+
+    def _together(self, calls: list[Callable[[], Any]]) -> list[Any]:
+        """Make calls at the same time, the first one here."""
+        if self._pool is None:
+            return [call() for call in calls]
+        pending = [self._pool.submit(call) for call in calls[1:]]
+        try:
+            return [calls[0](), *(future.result() for future in pending)]
+        finally:  # C has addresses only: after Ctrl-C, too, the arrays stay until it is done
+            wait(pending)
 
     def point_costs(self, P: Array, Q: Array) -> Array:
         """Return the weighted robust sum of each point, (m,); not finite in a focal plane."""

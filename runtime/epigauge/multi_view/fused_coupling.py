@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge._library import address
 from epigauge.kernels import table
-from epigauge.multi_view._native import PAIR, address, checked, function
+from epigauge.multi_view._native import PAIR, checked, function
 from epigauge.multi_view.coupling import solved
 from epigauge.multi_view.engine import Reference
 from epigauge.multi_view.envelope import Envelope
@@ -189,7 +190,9 @@ class FusedCoupling:
         """Return the sums of pairs of W T T^T W^T, and W T half (n, 12)."""
         arrays = tuple(map(address, (self.P, self.Q, T, half)))
         shapes = ((envelope.blocks, PAIR), (len(self.P), 12))
-        pairs, cameras = self.engine.summed("bundle_schur", (*arrays, envelope.reference), *shapes)
+        pairs, cameras = self.engine.summed(
+            "bundle_schur", (*arrays, envelope.reference), *shapes, pairs=True
+        )
         return pairs, self.engine.outward(cameras)
 
 

@@ -22,7 +22,7 @@ from epigauge.two_view.geometry import canonical_cameras
 from epigauge.two_view.losses import EFFICIENT, Loss, median, robust_scale
 from epigauge.two_view.refine import refine_fundamental
 
-__all__ = ["Frame", "initialize", "intersected"]
+__all__ = ["Frame", "initialize"]
 
 Array = NDArray[np.float64]
 
@@ -104,7 +104,7 @@ def initialize(
         from the residuals. "factorization" needs no such views: it minimises a bilinear error over
         all cameras at once, from random ones. "auto" registers, and where half the residuals are
         beyond a twentieth of the RMS of the image coordinates, it factors robustly, too, and keeps
-        what has the lower median residual.
+        what has the lower median residual. Weights of the tracks count when factoring only.
     incremental : bool
         When registering, adjust everything known, by a few robust steps, with each camera: slower,
         but errors do not add up over long sequences.
@@ -124,7 +124,8 @@ def initialize(
     Raises
     ------
     ArgumentError
-        If a view cannot be registered since it shares fewer than 6 points with those before it.
+        When registering, if no two views have enough points in common, or a view shares fewer than
+        6 points with those before it.
 
     References
     ----------
@@ -166,18 +167,17 @@ def _factored(
 
 def _median_residual(tracks: Tracks, found: Reconstruction) -> float:
     distances = np.linalg.norm(tracks.xy - found.project(tracks), axis=1)
-    return median(np.nan_to_num(distances, nan=np.inf))
+    return median(np.nan_to_num(distances[tracks.weights > 0.0], nan=np.inf))
 
 
 def _best_pair(tracks: Tracks, frame: Frame) -> tuple[int, int]:
     """Choose the pair with the most points that no homography explains."""
     common = _common_points(tracks)
-    pairs = np.argsort(-common, axis=None)[:_PAIRS]
+    pairs = np.argsort(-common, axis=None, kind="stable")[:_PAIRS]
     pairs = pairs[common.ravel()[pairs] >= _MATCHES]
     if not len(pairs):
-        raise ArgumentError(
-            "tracks", f"have no two views with {_MATCHES} common points", "longer tracks"
-        )
+        what = f"have no two views with {_MATCHES} common points"
+        raise ArgumentError("tracks", what, "longer tracks, or method='factorization'")
     chosen = np.stack(np.unravel_index(pairs, common.shape), axis=1)
     rows = {view: _rows(tracks, view) for view in np.unique(chosen)}
     both = [np.flatnonzero((rows[i] >= 0) & (rows[k] >= 0)) for i, k in chosen]
@@ -254,7 +254,16 @@ class _Builder:
         rows = _rows(self.tracks, i), _rows(self.tracks, k)
         points = np.flatnonzero((rows[0] >= 0) & (rows[1] >= 0))
         x1, x2 = (self.q[:, own[points]].T for own in rows)
-        result = refine_fundamental(x1, x2, loss="cauchy", max_iter=200)
+        backend = self.kernels.name
+        try:
+            result = refine_fundamental(x1, x2, loss="cauchy", max_iter=200, backend=backend)
+        except ArgumentError as error:
+            raise ArgumentError(
+                "tracks",
+                f"have common points in views {i} and {k}, the best two, that do not determine F "
+                f"({error.argument} {error.was})",
+                "points spread over two dimensions in both",
+            ) from None
         self.P[i], self.P[k] = canonical_cameras(result.F)
         self.Q[points] = result.points
         self.registered[[i, k]] = True
@@ -272,7 +281,7 @@ class _Builder:
                 "tracks",
                 f"leave views {outside} with fewer than {MIN_POINTS} points in common with the "
                 "others",
-                "longer or more tracks, or fewer views",
+                "longer or more tracks, fewer views, or method='factorization'",
             )
         return view
 
@@ -325,14 +334,9 @@ class _Builder:
         self.P[self.registered] = P / np.linalg.norm(P, axis=(1, 2), keepdims=True)
 
 
-def intersected(P: Array, problem: BundleProblem) -> Array:
-    """Return the points (m, 4) of least algebraic error: the lines of sight's linear meeting."""
-    return problem.engine.intersected(P)
-
-
 def _triangulated(P: Array, Q: Array, known: NDArray[np.bool_], problem: BundleProblem) -> Array:
     """Return points triangulated linearly where new, then refined, with a robust loss."""
-    linear = intersected(P, problem)
+    linear = problem.engine.intersected(P)
     Q = np.where(known[:, None], Q, linear)
     distances = problem.engine.distances(P, linear)
     scale = EFFICIENT["cauchy"] * robust_scale(np.nan_to_num(distances, posinf=1e3))

@@ -7,16 +7,18 @@ import ctypes
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.multi_view._native import LANES, LOSSES, Bundle, address, function
+from epigauge._library import address
+from epigauge.multi_view._native import LANES, Bundle, function
 from epigauge.multi_view.engine import LEAST_WEIGHT
 from epigauge.multi_view.envelope import Envelope, narrow
 from epigauge.multi_view.layout import Layout
-from epigauge.two_view.losses import Loss
+from epigauge.two_view.losses import LOSSES, Loss
 
-__all__ = ["Packed"]
+__all__ = ["Packed", "Range"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+Range = tuple[int, int]
 
 #: Observations a chunk, so that it stays in the fast cache, and the most lanes.
 _ROWS, _MOST_LANES = 384, 56
@@ -24,8 +26,13 @@ _ROWS, _MOST_LANES = 384, 56
 #: Cameras of which a full matrix is factored in no time.
 _FULL = 10
 
-#: What the passes over an observation cost, in pairs of observations.
-_PASSES = 20
+#: What the passes over an observation cost, in pairs of observations, and what a point costs in a
+#: pass, in observations.
+_PASSES, _POINT = 20, 3
+
+#: Least work of a thread, in pairs of observations: with less, to hand it over costs more than it
+#: saves.
+_SHARE = 1e5
 
 
 class Packed:
@@ -66,15 +73,16 @@ class Packed:
         made.scale2, made.loss = loss.scale**2, LOSSES.index(loss.name)
         return made
 
-    def shares(self, count: int) -> list[tuple[int, int]]:
-        """Split the chunks into ranges of about equal work, that of the pairs of observations."""
-        if count == 1:
-            return [(0, len(self.lanes) - 1)]
-        slots = np.diff(self.rows) // np.diff(self.lanes)
-        work = np.cumsum(np.diff(self.rows) * (slots + _PASSES))
-        cuts = np.searchsorted(work, work[-1] * np.arange(1, count) / count)
-        edges = [0, *cuts.tolist(), len(slots)]
-        return [(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+    def shares(self, count: int) -> tuple[list[Range], list[Range]]:
+        """Split the chunks into at most so many ranges of about equal work.
+
+        Once for passes over the observations, once for those over pairs of observations of a
+        point; little work makes fewer ranges.
+        """
+        rows, lanes = np.diff(self.rows), np.diff(self.lanes)
+        pairs = rows * (rows // lanes + _PASSES)
+        count = max(1, min(count, int(pairs.sum() / _SHARE)))
+        return _ranges(rows + _POINT * lanes, count), _ranges(pairs, count)
 
     def narrowed(self) -> Envelope:
         """Return the envelope; the cameras get the order that narrows it when first asked."""
@@ -103,6 +111,14 @@ class Packed:
         function("bundle_pack")(reference, *map(address, (*arrays, *self._observed)))
 
 
+def _ranges(work: Indices, count: int) -> list[Range]:
+    """Return ranges of about equal work; a chunk belongs to that which its middle falls into."""
+    middles = np.cumsum(work) - work / 2.0
+    cuts = np.searchsorted(middles, work.sum() * np.arange(1, count) / count)
+    edges = [0, *cuts.tolist(), len(work)]
+    return [(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+
+
 def _together(layout: Layout, counts: Indices) -> Indices:
     """Return the points by falling number of observations, those of the same views together."""
     first, last, view = layout.first[:-1], layout.first[1:] - 1, layout.view
@@ -120,4 +136,4 @@ def _chunks(counts: Indices) -> tuple[Indices, Indices]:
         lanes.append(lanes[-1] + width)
         rows.append(rows[-1] + width * slots)
         begin += width
-    return np.array(lanes), np.array(rows)
+    return np.array(lanes, np.intp), np.array(rows, np.intp)

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import lm
+from epigauge._library import address
 from epigauge.kernels import Table
 from epigauge.linear import Dense, Levenberg
-from epigauge.multi_view._native import address, function
+from epigauge.multi_view._native import function
 from epigauge.scatter import spread
 from epigauge.two_view.losses import EFFICIENT, Loss, robust_scale
 

@@ -129,7 +129,7 @@ def refine_fundamental_batch(
     x1, x2 = as_matches(x1, x2, at_least=0)
     bounds = _as_offsets(offsets, len(x1))
     count = len(bounds) - 1
-    w = None if weights is None else np.ascontiguousarray(as_weights(weights, len(x1)))
+    w = None if weights is None else as_weights(weights, len(x1))
     needed = f"a ({count}, 3, 3) array"
     starts = None if F0 is None else np.ascontiguousarray(as_real("F0", F0, needed))
     if starts is not None and starts.shape != (count, 3, 3):
@@ -166,6 +166,8 @@ def _as_offsets(offsets: ArrayLike, m: int) -> NDArray[np.intp]:
 
 def _check_options(options: dict[str, Any]) -> None:
     """Raise now, and not once a pair, what is wrong with every pair: tried on a made-up one."""
+    # Which no callback is to hear of.
+    options = {name: value for name, value in options.items() if name != "callback"}
     grid = np.stack(np.meshgrid([0.0, 1.0, 2.5], [0.0, 1.0, 3.0]), axis=-1).reshape(-1, 2)
     refine_fundamental(grid, grid @ [[1.0, 0.2], [0.1, 1.1]] + grid**2, **options)
 

@@ -57,7 +57,7 @@ def express(
     FundamentalResult or None
         F, cost and counts are there, all else follows when it is asked for.
     """
-    offsets = np.array([0, len(x1)])
+    offsets = np.array([0, len(x1)], np.intp)
     pair = native.refine_pairs(x1, x2, offsets, F0, weights, native_options, history=True)
     left, nfev, njev, nit, status = pair.numbers[0].tolist()
     if left:

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge._library import library
+from epigauge._library import address, library
 from epigauge.scatter import scatter_constraints
-from epigauge.two_view import native
 from epigauge.two_view.free import FreeProblem
 from epigauge.two_view.joint import JointProblem
+from epigauge.two_view.losses import LOSSES
 
 __all__ = ["FusedArrow", "FusedProblem", "FusedState"]
 
@@ -102,10 +102,10 @@ class FusedProblem:
         self._arrays = [np.ascontiguousarray(a) for a in (reference.q, reference.weights)]
         self._matches = _Matches(
             len(reference.weights),
-            *map(native.address, self._arrays),
+            *map(address, self._arrays),
             reference.loss.scale**2,
             self.problem,
-            native.LOSSES[reference.loss.name],
+            LOSSES.index(reference.loss.name),
         )
 
     def start(self, F: Array) -> tuple[Any, Array]:
@@ -138,7 +138,7 @@ class FusedProblem:
 
     def over_matches(self, name: str, *arrays: Array) -> Any:
         """Call a function of joint.c with contiguous arrays, some of which it fills."""
-        return _passes()[name](ctypes.addressof(self._matches), *map(native.address, arrays))
+        return _passes()[name](ctypes.addressof(self._matches), *map(address, arrays))
 
 
 class FusedArrow:

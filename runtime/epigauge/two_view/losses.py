@@ -22,7 +22,8 @@ def _linear(s: Array) -> _Values:
     return s, np.ones_like(s), np.zeros_like(s)
 
 
-#: The losses by name; all but the linear one are generated, the first four are SciPy's.
+#: The losses by name, in the order of runtime/c/losses.h; all but the linear one are generated, the
+#: first four are SciPy's.
 LOSSES = ("linear", "huber", "soft_l1", "cauchy", "truncated")
 
 

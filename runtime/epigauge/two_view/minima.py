@@ -29,7 +29,8 @@ Array = NDArray[np.float64]
 AMBIGUOUS = 9.0
 
 #: Size of the perturbations in standard deviations of F, and its limit for F of unit norm.
-#: Four deviations find the best minimum in 83 % of the scenes at 16 m with 20 starts, ten in all.
+#: Four deviations find the best minimum in 83 % of the scenes at 16 m with 20 starts, ten
+#: in nearly all.
 _SPREAD = 10.0
 _WIDEST = 2.0
 _SEED = 20040301

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import lm
-from epigauge._library import library
+from epigauge._library import address, library
 from epigauge.two_view.conditioning import OFFSET, RMS, Conditioning
+from epigauge.two_view.losses import LOSSES
 from epigauge.two_view.parameterizations import (
     Block,
     BlockF,
@@ -29,11 +30,9 @@ from epigauge.two_view.parameterizations import (
 )
 
 __all__ = [
-    "LOSSES",
     "Minimum",
     "Pair",
     "PairOptions",
-    "address",
     "minimize",
     "pair_options",
     "refine_pairs",
@@ -45,7 +44,6 @@ Array = NDArray[np.float64]
 #: Numbers of the choices in runtime/c/two_view.h.
 _CRITERIA = {"reprojection": 0, "sampson": 1, "epipolar": 2}
 _CHARTS = {Ortho: 0, Block: 1}
-LOSSES = {"linear": 0, "huber": 1, "soft_l1": 2, "cauchy": 3, "truncated": 4}
 
 #: Widths of the tables that C fills: history, results and numbers of a pair.
 _ROW, _DOUBLES, _INTS = 6, 145, 5
@@ -189,7 +187,7 @@ def _options(
     return _Options(
         _CRITERIA[criterion],
         kind,
-        LOSSES[loss],
+        LOSSES.index(loss),
         exact,
         damping == "seber",
         stopping.max_iter,
@@ -302,8 +300,3 @@ def refine_pairs(
     if not done:
         raise MemoryError(f"no room for {len(x1)} matches")
     return Pair(table, numbers, distances, rows)
-
-
-def address(array: NDArray[Any] | None) -> int | None:
-    """Return where the entries of an array begin, or None (NULL) for none."""
-    return None if array is None else int(array.__array_interface__["data"][0])

@@ -101,10 +101,10 @@ def refine_fundamental(
         Second derivatives for the eliminated structure; "joint" always uses Gauss-Newton.
     starts : int
         How many times to minimise: from `F0`, and from F0 plus random matrices that are the same at
-        every call, ten times as large as the standard deviation of F (`minima.perturbed`); 20 find
-        the best minimum of near-affine scenes. Of the minima that satisfy the oriented epipolar
-        constraint the lowest is returned; all are listed in ``result.minima``. Evaluations and
-        history count all starts, and `max_iter` holds for each.
+        every call, ten times as large as the standard deviation of F (`minima.perturbed`); 20
+        nearly always find the best minimum of near-affine scenes. Of the minima that satisfy the
+        oriented epipolar constraint the lowest is returned; all are listed in ``result.minima``.
+        Evaluations and history count all starts, and `max_iter` holds for each.
     fix : str or sequence of str
         Parts of the start value to leave exactly as they are (B&S section 4.4): "epipole1",
         "epipole2", "epipolar_transformation", in the coordinates of the images. The last means
@@ -282,7 +282,7 @@ def _express(
     assert isinstance(x2, np.ndarray)
     if F0 is not None:
         F0 = np.ascontiguousarray(as_fundamental(F0))
-    w = None if weights is None else np.ascontiguousarray(as_weights(weights, len(x1)))
+    w = None if weights is None else as_weights(weights, len(x1))
     assert plan.native is not None
     return express(x1, x2, F0, w, plan.options, plan.native, plan.noise_px)
 
