@@ -159,7 +159,7 @@ def table4(study: Study) -> Section:
             (*pair.epipoles, pair.name, *[1e3 * loose["LM", name][i].seconds for name in names])
             for i, pair in enumerate(pairs)
         ],
-        ("", "", "", ".2f"),
+        ("", "", "", ".3f"),
     )
     groups = {
         group: [i for i, pair in enumerate(pairs) if _outermost(pair) == group]
@@ -183,7 +183,7 @@ def table4(study: Study) -> Section:
             for group, members in groups.items()
             if members
         ],
-        ("", "", "d", ".2f"),
+        ("", "", "d", ".3f"),
     )
     lowest = np.min([[run.error_px for run in runs] for runs in tight.values()], axis=0)
     summary_rows = []
@@ -214,7 +214,7 @@ def table4(study: Study) -> Section:
             "cost above the lowest",
         ),
         summary_rows,
-        ("", "", ".5f", ".2f", ".2f", ".2f", ".1e"),
+        ("", "", ".5f", ".2f", ".3f", ".3f", ".1e"),
     )
     return Section(
         title,

@@ -224,7 +224,7 @@ def methods_section(study: Study) -> Section:
             Picture("methods", "Evaluations and success of all methods.", figure),
             table("methods_evaluations", "Mean evaluations of the cost.", counts, ".1f"),
             table("methods_success", "Trials with the lowest error, percent.", reached, ".0f"),
-            table("methods_milliseconds", "Median time, ms.", milliseconds, ".2f"),
+            table("methods_milliseconds", "Median time, ms.", milliseconds, ".3f"),
         ],
         [
             Claim(
@@ -247,8 +247,8 @@ def methods_section(study: Study) -> Section:
                 "not in the paper",
                 "ORTHO eliminated with exact Hessian takes the least time",
                 bool(cheapest[exact] <= cheapest[others].min()),
-                f"{cheapest[exact]:.2f} ms; BLOCK likewise {cheapest[-1]:.2f} ms; best of the "
-                f"others {cheapest[others].min():.2f} ms "
+                f"{cheapest[exact]:.3f} ms; BLOCK likewise {cheapest[-1]:.3f} ms; best of the "
+                f"others {cheapest[others].min():.3f} ms "
                 f"({names[others[int(np.argmin(cheapest[others]))]]})",
             ),
         ],
