@@ -75,6 +75,26 @@ def test_gross_errors_in_measured_tracks(data_dir: Path, name: str) -> None:
     assert median_residual(tracks, eg.initialize(tracks), good) < 1.0
 
 
+def test_observations_of_weight_zero_are_left_out_however_wrong() -> None:
+    clean = many_views.observed(many_views.cameras_and_points())
+    off = np.random.default_rng(0).random(len(clean)) < 0.2
+    start, found = [], []
+    for error in (0.0, 1e6):
+        xy = clean.xy + error * off[:, None]
+        tracks = eg.Tracks(clean.view, clean.point, xy, weights=1.0 * ~off)
+        start.append(eg.initialize(tracks).project(clean))
+        found.append(eg.bundle_adjust(tracks).reconstruction.project(clean))
+    np.testing.assert_array_equal(start[0], start[1])
+    assert distance(found[0], found[1]) < 1e-12
+
+
+def test_weight_zero_counts_where_a_point_has_nothing_else() -> None:
+    clean = many_views.observed(many_views.cameras_and_points())
+    lonely = (clean.point == 3) & (clean.view > 0)
+    tracks = eg.Tracks(clean.view, clean.point, clean.xy, weights=1.0 * ~lonely)
+    assert np.isfinite(eg.initialize(tracks).project(tracks)).all()
+
+
 @pytest.mark.parametrize("backend", ["c", "numpy"])
 def test_the_backends_start_alike(backend: str) -> None:
     many_views.need_backend(backend)

@@ -80,7 +80,7 @@ FIRST = """
 import sys, threading
 import numpy as np
 sys.setswitchinterval(1e-5)
-scene = np.load(sys.argv[1])
+scene = dict(np.load(sys.argv[1]))  # read now: an archive is for one thread
 barrier, found = threading.Barrier(8), [None] * 8
 import epigauge as eg
 

@@ -205,7 +205,7 @@ def bundle_adjust(
     parts = (
         table,
         layout,
-        frame.conditioned(tracks),
+        _measured(tracks, frame, start),
         np.asarray(tracks.weights),
         Loss(loss, scale_px / frame.scale),
         embedded and strategy.embedded and damping in (None, "covariant"),
@@ -258,6 +258,20 @@ def bundle_adjust(
         success=outcome.status > 0,
         history=outcome.history,
     )
+
+
+def _measured(tracks: Tracks, frame: Frame, start: Reconstruction) -> Array:
+    """Return the conditioned observations, shape (2, N).
+
+    Those of weight zero are put where the start has them: the least weight that keeps the equations
+    regular (`engine.LEAST_WEIGHT`) must not draw towards anything, however wrong.
+    """
+    q = frame.conditioned(tracks)
+    off = tracks.weights == 0.0
+    if off.any():
+        predicted = frame.points_in(start.project(tracks), tracks.view)[:, off]
+        q[:, off] = np.where(np.isfinite(predicted), predicted, 0.0)
+    return q
 
 
 def _problem(

@@ -56,7 +56,8 @@ class Frame:
 
     @staticmethod
     def of(tracks: Tracks) -> Frame:
-        """Choose the coordinates for some tracks."""
+        """Choose the coordinates for some tracks, without observations of weight zero."""
+        tracks = _counted(tracks)
         counts = np.bincount(tracks.view, minlength=tracks.n_views)
         sums = [np.bincount(tracks.view, tracks.xy[:, k]) / counts for k in (0, 1)]
         origins = np.stack(sums, axis=1)
@@ -68,7 +69,11 @@ class Frame:
 
     def conditioned(self, tracks: Tracks) -> Array:
         """Return the conditioned observations, shape (2, N)."""
-        return np.ascontiguousarray(((tracks.xy - self.origins[tracks.view]) / self.scale).T)
+        return self.points_in(tracks.xy, tracks.view)
+
+    def points_in(self, xy: Array, view: Indices) -> Array:
+        """Return conditioned image points, shape (2, N), from pixels (N, 2)."""
+        return np.ascontiguousarray(((xy - self.origins[view]) / self.scale).T)
 
     def cameras_in(self, P: Array) -> Array:
         """Return cameras to conditioned coordinates from cameras to pixels."""
@@ -104,7 +109,8 @@ def initialize(
         from the residuals. "factorization" needs no such views: it minimises a bilinear error over
         all cameras at once, from random ones. "auto" registers, and where half the residuals are
         beyond a twentieth of the RMS of the image coordinates, it factors robustly, too, and keeps
-        what has the lower median residual. Weights of the tracks count when factoring only.
+        what has the lower median residual. Weights count when factoring; when registering,
+        observations of weight zero are left out where enough others remain.
     incremental : bool
         When registering, adjust everything known, by a few robust steps, with each camera: slower,
         but errors do not add up over long sequences.
@@ -145,7 +151,22 @@ def initialize(
     return other if _median_residual(tracks, other) < residual else found
 
 
+def _counted(tracks: Tracks) -> Tracks:
+    """Return the tracks without observations of weight zero; with them where too few are left."""
+    counts = tracks.weights > 0.0
+    if counts.all():
+        return tracks
+    view, point, xy, weights = (
+        array[counts] for array in (tracks.view, tracks.point, tracks.xy, tracks.weights)
+    )
+    try:
+        return Tracks(view, point, xy, tracks.n_views, tracks.n_points, weights)
+    except ArgumentError:
+        return tracks
+
+
 def _registered(tracks: Tracks, frame: Frame, kernels: Table, incremental: bool) -> Reconstruction:
+    tracks = _counted(tracks)
     builder = _Builder(tracks, frame.conditioned(tracks), kernels)
     builder.begin(*_best_pair(tracks, frame))
     while not builder.registered.all():
