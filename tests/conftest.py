@@ -1,8 +1,9 @@
-"""Fixtures shared by all tests: where the real data lies."""
+"""What all tests share: where the real data lies, and that Ctrl-C can be tested."""
 
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,12 @@ PAIRS = (
     "templeSR_1_2",
     "templeSR_9_10",
 )
+
+
+def pytest_configure() -> None:
+    """Take Ctrl-C as usual where the shell has started the tests so that they ignore it."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
