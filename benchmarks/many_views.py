@@ -270,13 +270,15 @@ def growth_table(growth: list[dict[str, Any]]) -> str:
 def plot(growth: list[dict[str, Any]], path: Path) -> None:
     """Draw time and memory by size."""
     import matplotlib.pyplot as plt
-    from matplotlib.ticker import NullFormatter
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     figure, axes = plt.subplots(1, 2, figsize=(8.0, 3.2), layout="constrained")
     size = [found["observations"] for found in growth]
     for ax, key, label in zip(axes, ("ms", "mb"), ("ms a step", "MB"), strict=True):
         ax.loglog(size, [found[key] for found in growth], "o-")
         ax.set(xlabel="observations", ylabel=label)
+        ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         ax.yaxis.set_minor_formatter(NullFormatter())
         ax.grid(True, which="both", alpha=0.3)
     figure.savefig(path, dpi=150)

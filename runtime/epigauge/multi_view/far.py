@@ -115,7 +115,7 @@ def minimize(
         return replace(
             first,
             state=nearer,
-            system=problem.linearize(nearer),
+            system=None,
             status=-2 if stopped else 0,
             history=tuple(history),
         )
