@@ -68,6 +68,20 @@ class Meanings(SphinxDirective):
         return [table(("", "meaning"), rows)]
 
 
+class Flags(SphinxDirective):
+    """The vocabulary of verdicts: ``.. flags::``."""
+
+    def run(self) -> list[nodes.Node]:
+        """Return name, meaning, remedy, and which kinds of result a flag spoils."""
+        from epigauge.verdicts import FLAGS
+
+        rows = (
+            (name, flag.sentence, flag.remedy, ", ".join(flag.spoils) or "-")
+            for name, flag in FLAGS.items()
+        )
+        return [table(("flag", "what was found", "remedy", "must not be used"), rows)]
+
+
 class Commands(SphinxDirective):
     """The commands of the command line, each in a section of its own."""
 
@@ -103,5 +117,6 @@ def setup(app: Sphinx) -> dict[str, object]:
     """Register the directives."""
     app.add_directive("datasets", Datasets)
     app.add_directive("meanings", Meanings)
+    app.add_directive("flags", Flags)
     app.add_directive("commands", Commands)
     return {"version": "1", "parallel_read_safe": True}

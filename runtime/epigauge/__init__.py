@@ -10,7 +10,7 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
-    from epigauge import casadi, colmap, datasets, interop, kernels
+    from epigauge import casadi, colmap, datasets, interop, kernels, verdicts
     from epigauge.errors import ArgumentError, BackendError, EpigaugeError, FileFormatError
     from epigauge.images import ImageMatches, load_image, match_images
     from epigauge.io import (
@@ -95,6 +95,7 @@ __all__ = [
     "set_backend",
     "triangulate",
     "two_view_scene",
+    "verdicts",
 ]
 
 #: Modules below this package, and the public names that they define.
@@ -122,6 +123,7 @@ _WHERE = {
 _MODULES = {
     **{name: name for name in ("casadi", "colmap", "datasets", "interop", "kernels")},
     **{name: name for name in ("errors", "images", "io", "lm", "plots", "reports", "scenes")},
+    "verdicts": "verdicts",
     "gauge": "multi_view.gauge",
 }
 _HOME = {name: module for module, names in _WHERE.items() for name in names.split()}

@@ -5,7 +5,8 @@ from __future__ import annotations
 import epigauge as eg
 import numpy as np
 import pytest
-from epigauge.two_view.diagnostics import FLAGS, _variance_ratio_99, fit_homography
+from epigauge.two_view.diagnostics import _variance_ratio_99, fit_homography
+from epigauge.verdicts import FLAGS
 from two_views import Array, homogeneous, inliers
 
 FOCAL = 1000.0

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from epigauge import verdicts
 from epigauge.images.matching import ImageMatches
-from epigauge.two_view.diagnostics import FLAGS
 from epigauge.two_view.robust import RobustResult
 
 __all__ = ["epipole_text", "explained", "inside", "summary", "with_deviation"]
@@ -50,7 +50,7 @@ def summary(
 
 def explained(result: RobustResult) -> dict[str, str]:
     """Return what the matches do not support: each flag of a result with a sentence."""
-    found = {flag: _sentence(FLAGS[flag]) for flag in result.flags}
+    found = verdicts.explained(result.flags)
     if result.rank < 7:
         found["rank"] = f"The matches determine only {result.rank} of the 7 directions of F."
     if not result.success:

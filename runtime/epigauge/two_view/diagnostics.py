@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from epigauge.two_view.covariance import residual_noise
 from epigauge.two_view.criteria import Reprojection
 from epigauge.two_view.solve import Matches, Options, Solution
+from epigauge.verdicts import ordered
 
 __all__ = [
-    "FLAGS",
     "Evidence",
     "diagnose",
     "evidence",
@@ -27,34 +27,6 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-
-#: Every flag and what it says.
-FLAGS = {
-    "planar scene": (
-        "one homography explains all matches within the noise: a planar scene, or a camera that "
-        "only turned; the matches do not determine F"
-    ),
-    "pure rotation": (
-        "the homography that explains all matches could be that of a camera that only turned; a "
-        "plane cannot be excluded"
-    ),
-    "near-affine": (
-        "an affine fundamental matrix, of 4 parameters, explains the matches within the noise: "
-        "perspective does not show, and several minima are possible"
-    ),
-    "weak geometry": (
-        "the standard deviation of F exceeds a tenth of its norm, in centred coordinates scaled to "
-        "the spread of the matches: F and first-order covariances are not to be relied on"
-    ),
-    "not oriented": (
-        "F puts some points in front of one camera only (oriented epipolar constraint): a wrong "
-        "minimum or wrong matches"
-    ),
-    "few matches": (
-        "so few more matches than parameters that the noise cannot be estimated to 25 %"
-    ),
-    "ambiguous": "several minima lie within the noise of one another",
-}
 
 #: A redundancy below this estimates the noise worse than to 1 / sqrt(2 * 8) = 25 %.
 _REDUNDANCY = 8
@@ -150,7 +122,7 @@ def evidence(matches: Matches, options: Options, solution: Solution) -> Evidence
 
 
 def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, ...]:
-    """Return the flags that a solution raises, in the order of `FLAGS`.
+    """Return the flags that a solution raises, in the order of `verdicts.FLAGS`.
 
     Parameters
     ----------
@@ -164,7 +136,7 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     Returns
     -------
     tuple of str
-        Names from `FLAGS`.
+        Names from `verdicts.FLAGS`.
 
     Notes
     -----
@@ -195,7 +167,7 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     raised["near-affine"] = _affine_cost(found) <= S + _AFFINE * noise2
     raised["weak geometry"] = not deviation <= _WEAK
     raised["few matches"] = n - p < _REDUNDANCY
-    return tuple(name for name in FLAGS if raised[name])
+    return ordered(name for name, is_raised in raised.items() if is_raised)
 
 
 def without_chance_matches(found: Evidence, rejected: int, chance: float) -> Evidence:

@@ -147,7 +147,7 @@ class FundamentalResult(Partial):
     def flags(self) -> tuple[str, ...]:
         """What the matches do not support, computed when asked for.
 
-        Names from `epigauge.two_view.diagnostics.FLAGS`, which explains them; the tests are in
+        Names from `epigauge.verdicts.FLAGS`, which explains them; the tests are in
         `epigauge.two_view.diagnostics.diagnose`. They use the noise of the residuals.
         """
         return self._flags(self._evidence)

@@ -1,0 +1,167 @@
+"""The vocabulary of verdicts: what can be the matter with a result, what it means, what to do.
+
+Every solver and every command takes its flags from here, so that one word means one thing. A flag
+that *spoils* a kind of result says that the numbers must not be used: the result's `success` is
+False then, and a command ends with exit code 1. Any other flag says: with care.
+
+>>> from epigauge.verdicts import FLAGS, explained, usable
+>>> FLAGS["still camera"].sentence
+'every point stays where it was: the camera did not move, or both images are one'
+>>> usable(["nearly planar"], "F"), usable(["planar scene"], "F"), usable(["planar scene"], "E")
+(True, False, True)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+__all__ = ["FLAGS", "Flag", "Kind", "explained", "ordered", "usable"]
+
+#: Kinds of result: a fundamental matrix, an essential one, a reconstruction from many views.
+Kind = Literal["F", "E", "views"]
+
+
+@dataclass(frozen=True)
+class Flag:
+    """One thing that can be the matter with a result.
+
+    Attributes
+    ----------
+    sentence : str
+        What was found.
+    remedy : str
+        What to do about it.
+    spoils : tuple of str
+        Kinds of result that must not be used then: "F", "E", "views".
+    """
+
+    sentence: str
+    remedy: str
+    spoils: tuple[Kind, ...] = ()
+
+
+#: Every flag, in the order that results list them.
+FLAGS = {
+    "no common geometry": Flag(
+        "the matches agree no better than wrong ones do by chance: nothing says that both images "
+        "show one rigid scene",
+        "use photographs that overlap, or matches that are stricter (a smaller ratio)",
+        ("F", "E", "views"),
+    ),
+    "still camera": Flag(
+        "every point stays where it was: the camera did not move, or both images are one",
+        "take images from different places",
+        ("F", "E", "views"),
+    ),
+    "planar scene": Flag(
+        "one homography explains the matches within the noise: a planar scene, or a camera that "
+        "only turned; the matches do not determine F",
+        "match points off the plane too, or use the homography; with K known, essential=True "
+        "leaves at most two motions",
+        ("F", "views"),
+    ),
+    "nearly planar": Flag(
+        "one homography explains nearly all matches, and the few others fix F: off the plane it "
+        "may be wrong by many pixels",
+        "match more points off the plane, and check F there before it is used",
+    ),
+    "pure rotation": Flag(
+        "the homography that explains all matches could be that of a camera that only turned; a "
+        "plane cannot be excluded",
+        "take images from different places",
+        ("F", "E", "views"),
+    ),
+    "undetermined": Flag(
+        "some parameters can change without changing any residual",
+        "add matches or views that fix them, or hold them fixed",
+        ("F", "E", "views"),
+    ),
+    "gross errors": Flag(
+        "a few matches carry most of the error: wrong ones among them, which least squares bends "
+        "the result to",
+        "find the right matches with estimate_fundamental (`epigauge estimate`), or mark them "
+        "(`--inliers`)",
+        ("F", "E"),
+    ),
+    "behind the cameras": Flag(
+        "some points lie behind a camera",
+        "look for wrong matches, and try more starts",
+    ),
+    "not oriented": Flag(
+        "some points are in front of one camera only (oriented epipolar constraint): a wrong "
+        "minimum or wrong matches",
+        "look for wrong matches, and try more starts",
+    ),
+    "ambiguous": Flag(
+        "several minima lie within the noise of one another",
+        "compare them (result.minima), or add matches that tell them apart",
+    ),
+    "weak geometry": Flag(
+        "the standard deviation of the result exceeds a tenth of its size: first-order covariances "
+        "are not to be relied on",
+        "use more matches, spread over both images and in depth, or a longer baseline",
+    ),
+    "near-affine": Flag(
+        "an affine model explains the matches within the noise: perspective does not show, and "
+        "several minima are possible",
+        "use several starts (starts=20), or images with more perspective",
+    ),
+    "few matches": Flag(
+        "so few more matches than parameters that the noise cannot be estimated to 25 %",
+        "use more matches, or give noise_px where it is known",
+    ),
+    "not pixels": Flag(
+        "the coordinates spread over less than 2: not pixels?",
+        "give coordinates in pixels; lengths and thresholds are in the unit of the coordinates",
+    ),
+    "distorted cameras": Flag(
+        "lens distortion bends the points by more than their noise, which no F can follow",
+        "undistort the points first",
+        ("F",),
+    ),
+}
+
+
+def ordered(names: Iterable[str]) -> tuple[str, ...]:
+    """Return names of flags, each once, in the order of `FLAGS`.
+
+    Raises
+    ------
+    KeyError
+        On a name that is not in the vocabulary.
+    """
+    raised = set(names)
+    if unknown := raised - FLAGS.keys():
+        raise KeyError(f"no such flag: {', '.join(sorted(unknown))}")
+    return tuple(name for name in FLAGS if name in raised)
+
+
+def usable(names: Iterable[str], kind: Kind) -> bool:
+    """Tell whether a result with these flags may be used.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Flags that were raised.
+    kind : {"F", "E", "views"}
+        What the result is.
+
+    Returns
+    -------
+    bool
+        False where a flag spoils results of this kind.
+    """
+    return not any(kind in FLAGS[name].spoils for name in names)
+
+
+def explained(names: Iterable[str]) -> dict[str, str]:
+    """Return each flag with a text for people: what was found, and what to do."""
+    return {
+        name: f"{_capital(FLAGS[name].sentence)}. {_capital(FLAGS[name].remedy)}." for name in names
+    }
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
