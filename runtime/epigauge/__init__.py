@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge import casadi, colmap, datasets, interop, kernels, verdicts
+    from epigauge.cameras import Cameras, MetricReconstruction
     from epigauge.errors import ArgumentError, BackendError, EpigaugeError, FileFormatError
     from epigauge.images import ImageMatches, load_image, match_images
     from epigauge.io import (
@@ -50,6 +51,7 @@ __all__ = [
     "ArgumentError",
     "BackendError",
     "BundleResult",
+    "Cameras",
     "Comparison",
     "EpigaugeError",
     "FileFormatError",
@@ -57,6 +59,7 @@ __all__ = [
     "FundamentalResult",
     "ImageMatches",
     "Matches",
+    "MetricReconstruction",
     "MultiViewScene",
     "Reconstruction",
     "ReconstructionCovariance",
@@ -100,6 +103,7 @@ __all__ = [
 
 #: Modules below this package, and the public names that they define.
 _WHERE = {
+    "cameras": "Cameras MetricReconstruction",
     "errors": "ArgumentError BackendError EpigaugeError FileFormatError",
     "images": "ImageMatches load_image match_images",
     "io": (
