@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("sympy")
 
 import sympy as sp
-from epigauge_derive.models import orthonormal, rotations
+from epigauge_derive.models import block, orthonormal, rotations
 
 U, V, SIGMA = orthonormal.U.matrix(), orthonormal.V.matrix(), orthonormal.SIGMA.symbol()
 
@@ -129,6 +129,27 @@ def test_camera_of_eq5_has_epipole_u3_and_gives_f_back(u_v):
     assert (F.T * epipole).expand() == sp.zeros(3, 1)
     # [u3]_x [u3]_x = -I on the span of u1 and u2; a left-handed U changes the sign once more.
     assert (cross(epipole) * H + u.det() * F).expand() == sp.zeros(3, 3)
+
+
+def test_camera_of_eq5_is_the_canonic_camera_of_eq4_as_printed():
+    u1, u2, u3, v1, v2 = (U[:, 0], U[:, 1], U[:, 2], V[:, 0], V[:, 1])
+    printed = (u2 * v1.T - SIGMA * u1 * v2.T).row_join(u3)
+    assert (orthonormal.canonical_camera(U, V, SIGMA) - printed).expand() == sp.zeros(3, 4)
+    u, v = orthonormal_pairs()[0]
+    F = orthonormal.fundamental(u, v, SIGMA)
+    by_eq4 = (cross(u[:, 2]) * F).row_join(u[:, 2])
+    assert (orthonormal.canonical_camera(u, v, SIGMA) - by_eq4).expand() == sp.zeros(3, 4)
+
+
+@pytest.mark.parametrize("u_v", orthonormal_pairs())
+def test_block_camera_is_the_canonic_camera_of_its_f(u_v):
+    u, v = u_v
+    M = block.M.matrix()
+    F, camera = block.fundamental(u, v, M), block.canonical_camera(u, v, M)
+    by_eq4 = (cross(u.det() * u[:, 2]) * F).row_join(u[:, 2])
+    assert (camera - by_eq4).expand() == sp.zeros(3, 4)
+    ortho = orthonormal.canonical_camera(u, v, SIGMA)
+    assert (block.canonical_camera(u, v, sp.diag(1, SIGMA)) - ortho).expand() == sp.zeros(3, 4)
 
 
 @pytest.mark.parametrize("u_v", orthonormal_pairs())

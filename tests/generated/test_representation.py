@@ -6,8 +6,8 @@ import itertools
 
 import numpy as np
 import pytest
-from epigauge.kernels import SIGNATURES
-from laws import distance, factor_cases, fundamental, orthonormal
+from epigauge.two_view.parameterizations import Maps
+from laws import assert_jacobian, distance, factor_cases, fundamental, orthonormal
 
 CASES = factor_cases()
 SIGNS = list(itertools.product((1.0, -1.0), repeat=3))
@@ -99,18 +99,51 @@ def test_rotation_is_orthonormal_and_a_product_of_three(table):
     assert distance(moved, np.einsum("ij,jkn->ikn", U, R)) <= 2e-15
 
 
-@pytest.mark.parametrize("name", sorted(n for n in SIGNATURES if n.startswith("maps_")))
-def test_chart_of_maps_freezes_its_entries(table, name):
-    frozen1, frozen2, frozen = map(int, name[-3:])
-    parameters = np.random.default_rng(4).uniform(-1.0, 1.0, 7)
-    F, _, _, P2, _ = getattr(table, name)(parameters)
-    e1, e2 = (np.insert(parameters[k : k + 2], at, 1.0) for k, at in ((0, frozen1), (2, frozen2)))
-    assert np.abs(F @ e1).max() <= 1e-15
-    assert np.abs(F.T @ e2).max() <= 1e-15
-    inner = np.delete(np.delete(F, frozen2, axis=0), frozen1, axis=1)
-    np.testing.assert_array_equal(inner.ravel(), np.insert(parameters[4:], frozen, 1.0))
-    np.testing.assert_array_equal(P2[:, 3], e2)
-    assert same_up_to_scale(cross(P2[:, 3]) @ P2[:, :3], F, 1e-14)
+def charts():
+    """Return an F for each of the 36 charts: where e, e' and their transformation are largest."""
+    rng = np.random.default_rng(4)
+    made = []
+    for i, j, row, column in itertools.product(range(3), range(3), range(2), range(2)):
+        e1, e2 = (np.insert(rng.uniform(-0.9, 0.9, 2), at, 1.0) for at in (i, j))
+        inner = rng.uniform(-0.9, 0.9, (2, 2))
+        inner[row, column] = -1.0
+        F = np.insert(np.insert(inner, i, 0.0, axis=1), j, 0.0, axis=0)
+        # The other entries follow from F e = 0 and F^T e' = 0.
+        F[:, i] = -(F @ e1)
+        F[j] = -(e2 @ F)
+        made.append(pytest.param(F, e1, e2, id=f"{i}{j}{row}{column}"))
+    return made
+
+
+@pytest.mark.parametrize(("F", "e1", "e2"), charts())
+def test_maps_finds_the_chart_of_every_f_and_gives_it_back(table, F, e1, e2):
+    maps = Maps(table)
+    estimate = maps.start(-2.5 * F)
+    assert np.abs(estimate.parameters).max() <= 1.0  # the largest entries are those frozen
+    assert distance(maps.fundamental(estimate), -F) <= 1e-14
+    P2, _ = maps.camera(estimate)
+    assert distance(P2[:, 3], e2) <= 1e-14
+    # P' = ([e']_x F | e'), whatever the order of the axes.
+    assert distance(P2[:, :3], cross(e2) @ -F) <= 1e-14
+    again = maps.start(maps.fundamental(estimate))
+    assert (again.axes1, again.axes2) == (estimate.axes1, estimate.axes2)
+    assert distance(again.parameters, estimate.parameters) <= 1e-13
+
+
+@pytest.mark.parametrize(("F", "e1", "e2"), charts())
+def test_maps_derivatives_in_every_chart(table, F, e1, e2):
+    maps = Maps(table)
+    estimate = maps.start(F)
+
+    def at(parameters):
+        return estimate._replace(parameters=parameters)
+
+    dF, d2F = maps.derivatives(estimate)
+    _, dP2 = maps.camera(estimate)
+    p = estimate.parameters
+    assert_jacobian(lambda p: maps.fundamental(at(p)).ravel(), p, dF)
+    assert_jacobian(lambda p: maps.derivatives(at(p))[0], p, d2F)
+    assert_jacobian(lambda p: maps.camera(at(p))[0].ravel(), p, dP2)
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -379,7 +379,7 @@ class TestParameterizations:
 
         def moved(delta: Array) -> Any:
             if isinstance(estimate, MapsF):  # without a change of chart, which changes the scale
-                return MapsF(estimate.chart, estimate.parameters + delta)
+                return estimate._replace(parameters=estimate.parameters + delta)
             return chart.retract(estimate, delta)
 
         def entries(delta: Array) -> Array:

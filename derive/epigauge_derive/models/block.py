@@ -10,6 +10,7 @@ from __future__ import annotations
 import sympy as sp
 
 from epigauge_derive.kernel import Input, Kernel, Output, derivatives_at
+from epigauge_derive.models.orthonormal import camera_of
 from epigauge_derive.models.rotations import euler_rotation
 
 U, V, M = Input("U", (3, 3)), Input("V", (3, 3)), Input("M", (2, 2))
@@ -46,13 +47,8 @@ def fundamental(u: sp.Matrix, v: sp.Matrix, m: sp.Matrix) -> sp.Matrix:
 
 
 def canonical_camera(u: sp.Matrix, v: sp.Matrix, m: sp.Matrix) -> sp.Matrix:
-    """Return P' = (H | u3), where H turns F by a right angle in the plane of u1, u2.
-
-    With [u3]_x u1 = u2 and [u3]_x u2 = -u1 this is ([u3]_x F | u3); B&S eq. (5) is the case
-    M = diag(1, sigma).
-    """
-    quarter_turn = sp.Matrix([[0, -1], [1, 0]])
-    return (u[:, :2] * quarter_turn * m * v[:, :2].T).row_join(u[:, 2])
+    """Return P' = ([e']_x F | e'); B&S eq. (5) is the case M = diag(1, sigma)."""
+    return camera_of(u, sp.diag(m, 0), v)
 
 
 def kernels() -> list[Kernel]:

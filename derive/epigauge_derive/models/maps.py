@@ -1,9 +1,10 @@
-"""The 36 minimal parameterisations by epipoles and epipolar transformation (MAPS).
+"""The minimal parameterisations by epipoles and epipolar transformation (MAPS).
 
 Each homogeneous entity, e, e' and the 2x2 epipolar transformation, has one entry frozen to one:
-3 * 3 * 4 charts (B&S section 2, after Zhang). The chart that freezes the last entry of both
-epipoles is derived as the paper's references write it; permuting the axes of each image gives the
-others.
+3 * 3 * 4 charts (B&S section 2, after Zhang). One is derived, which freezes the last entry of both
+epipoles and the first of the transformation. The 3! * 3! orders of the axes of both images give
+all 36: with permutation matrices S of image 1 and S' of image 2, F -> S' F S^T, e -> S e,
+e' -> S' e', and [S' e']_x = det(S') S' [e']_x S'^T gives the camera.
 """
 
 from __future__ import annotations
@@ -11,65 +12,43 @@ from __future__ import annotations
 import sympy as sp
 
 from epigauge_derive.kernel import Input, Kernel, Output, derivatives_at
+from epigauge_derive.models.orthonormal import cross
 
 PARAMETERS = Input("parameters", (7,))
 
 
-def chart(frozen1: int, frozen2: int, frozen: int) -> tuple[sp.Matrix, sp.Matrix]:
-    """Return F and P' = ([e']_x F | e') as functions of the seven parameters.
+def chart() -> tuple[sp.Matrix, sp.Matrix]:
+    """Return F and e' as functions of (x, y, x', y', b, c, d).
 
-    Parameters
-    ----------
-    frozen1, frozen2 : int
-        Entry of e and of e' that is one.
-    frozen : int
-        Entry of the transformation (a, b, c, d) that is one.
-
-    The parameters are the two free entries of e, those of e', and the three of (a, b, c, d).
+    e = (x, y, 1) and e' = (x', y', 1) are the null vectors; (1, b; c, d) is the upper left block.
     """
-    x, y, x_, y_, *free = PARAMETERS.entries()
-    free.insert(frozen, sp.S.One)
-    a, b, c, d = free
-    e, e_ = [x, y], [x_, y_]
-    e.insert(frozen1, sp.S.One)
-    e_.insert(frozen2, sp.S.One)
-    inner = sp.Matrix([[a, b], [c, d]])
-    F = sp.zeros(3, 3)
-    axes1 = [k for k in range(3) if k != frozen1]
-    axes2 = [k for k in range(3) if k != frozen2]
-    for i, row in enumerate(axes2):
-        for j, column in enumerate(axes1):
-            F[row, column] = inner[i, j]
-        # F e = 0 and F^T e' = 0 give the row and the column of the frozen entries.
-        F[row, frozen1] = -sum(F[row, column] * e[column] for column in axes1)
-    for column in range(3):
-        F[frozen2, column] = -sum(F[row, column] * e_[row] for row in axes2)
-    cross = sp.Matrix([[0, -e_[2], e_[1]], [e_[2], 0, -e_[0]], [-e_[1], e_[0], 0]])
-    return F.expand(), (cross * F).expand().row_join(sp.Matrix(e_))
+    x, y, x_, y_, b, c, d = PARAMETERS.entries()
+    inner = sp.Matrix([[sp.S.One, b], [c, d]])
+    # F e = 0 gives the last column, F^T e' = 0 the last row.
+    wide = inner.row_join(-inner * sp.Matrix([x, y]))
+    F = wide.col_join(-sp.Matrix([[x_, y_]]) * wide)
+    return F.expand(), sp.Matrix([x_, y_, 1])
 
 
 def kernels() -> list[Kernel]:
-    """Return one kernel a chart: F and P' with their derivatives by the seven parameters."""
-    made = []
+    """Return F and P' with their derivatives by the seven parameters."""
     parameters = PARAMETERS.entries()
-    for number in range(36):
-        frozen1, frozen2, frozen = number // 12, number // 4 % 3, number % 4
-        F, P2 = chart(frozen1, frozen2, frozen)
-        dF, d2F = derivatives_at(list(F), parameters, {})
-        dP2, _ = derivatives_at(list(P2), parameters, {})
-        made.append(
-            Kernel(
-                f"maps_{frozen1}{frozen2}{frozen}",
-                f"F and P' by epipoles with entries {frozen1} of e and {frozen2} of e' and entry "
-                f"{frozen} of the epipolar transformation frozen to one (MAPS, B&S section 2).",
-                (PARAMETERS,),
-                (
-                    Output.of("F", F),
-                    Output.of("dF", dF),
-                    Output.of("d2F", d2F),
-                    Output.of("P2", P2),
-                    Output.of("dP2", dP2),
-                ),
-            )
+    F, e_ = chart()
+    P2 = (cross(e_) * F).expand().row_join(e_)
+    dF, d2F = derivatives_at(list(F), parameters, {})
+    dP2, _ = derivatives_at(list(P2), parameters, {})
+    return [
+        Kernel(
+            "maps",
+            "F and P' = ([e']_x F | e') by the epipoles (x, y, 1), (x', y', 1) and the epipolar "
+            "transformation (1, b; c, d) (MAPS, B&S section 2).",
+            (PARAMETERS,),
+            (
+                Output.of("F", F),
+                Output.of("dF", dF),
+                Output.of("d2F", d2F),
+                Output.of("P2", P2),
+                Output.of("dP2", dP2),
+            ),
         )
-    return made
+    ]

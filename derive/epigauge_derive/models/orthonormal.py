@@ -1,4 +1,9 @@
-"""The orthonormal representation F ~ U diag(1, sigma, 0) V^T and its minimal update (B&S 2004)."""
+"""The orthonormal representation F ~ U diag(1, sigma, 0) V^T and its minimal update (B&S 2004).
+
+Three equations of the paper are the inputs of this model: R(theta) = Rx Ry Rz (1, in `rotations`),
+F = U diag(1, sigma, 0) V^T (2) and the update of U, V, sigma (3). The rest is derived: the camera
+(5) from ([e']_x F | e') (4), and the Jacobian A_perp (6, 7) by differentiating (5) through (3).
+"""
 
 from __future__ import annotations
 
@@ -12,20 +17,35 @@ DELTA = Input("delta", (7,))
 FACTORS = (U, V, SIGMA)
 
 
+def cross(v: sp.Matrix) -> sp.Matrix:
+    """Return [v]_x, with [v]_x w = v x w."""
+    x, y, z = v
+    return sp.Matrix([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def middle(sigma: sp.Expr) -> sp.Matrix:
+    """Return diag(1, sigma, 0), the middle factor of B&S eq. (2)."""
+    return sp.diag(1, sigma, 0)
+
+
 def fundamental(u: sp.Matrix, v: sp.Matrix, sigma: sp.Expr) -> sp.Matrix:
-    """Return F = u1 v1^T + sigma u2 v2^T, B&S eq. (2)."""
-    return u[:, 0] * v[:, 0].T + sigma * u[:, 1] * v[:, 1].T
+    """Return F = U diag(1, sigma, 0) V^T, B&S eq. (2)."""
+    return u * middle(sigma) * v.T
+
+
+def camera_of(u: sp.Matrix, inner: sp.Matrix, v: sp.Matrix) -> sp.Matrix:
+    """Return P' = ([e']_x F | e') of F = U inner V^T with e' = u3 (B&S eq. 4).
+
+    For a rotation U, [U w]_x = U [w]_x U^T, and e' = U (0, 0, 1)^T, so that
+    [e']_x F = U [(0, 0, 1)^T]_x inner V^T. For a U of determinant -1 this is the camera of -F.
+    """
+    axis = sp.Matrix([0, 0, 1])
+    return (u * cross(axis) * inner * v.T).row_join(u * axis)
 
 
 def canonical_camera(u: sp.Matrix, v: sp.Matrix, sigma: sp.Expr) -> sp.Matrix:
-    """Return the canonic second camera P' = (u2 v1^T - sigma u1 v2^T | u3), B&S eq. (5).
-
-    Obtained as the paper obtains it, from ([e']_x F | e') with e' = u3; the products
-    [u3]_x u1 = u2 and [u3]_x u2 = -u1 hold for a right-handed U, and for a left-handed one the
-    camera is the canonic one of -F.
-    """
-    plane_homography = u[:, 1] * v[:, 0].T - sigma * u[:, 0] * v[:, 1].T
-    return plane_homography.row_join(u[:, 2])
+    """Return the canonic second camera of eq. (2): (u2 v1^T - sigma u1 v2^T | u3), B&S eq. (5)."""
+    return camera_of(u, middle(sigma), v)
 
 
 def updated() -> tuple[sp.Matrix, sp.Matrix, sp.Expr]:

@@ -193,13 +193,15 @@ class MapsF(NamedTuple):
 
     Attributes
     ----------
-    chart : str
-        Which entries of e, e' and of the transformation are frozen to one.
+    axes1, axes2 : tuple of int
+        Order of the axes of each image: the last axis is that of the epipole's largest entry, the
+        first that of the largest entry of the epipolar transformation. These entries are one.
     parameters : ndarray, shape (7,)
-        The others.
+        The others, in that order.
     """
 
-    chart: str
+    axes1: tuple[int, ...]
+    axes2: tuple[int, ...]
     parameters: Array
 
 
@@ -216,10 +218,13 @@ class Maps:
         U, _, V = np.linalg.svd(F)
         e, e_ = V[2], U[:, 2]
         i, j = int(np.argmax(np.abs(e))), int(np.argmax(np.abs(e_)))
-        inner = np.delete(np.delete(F, j, axis=0), i, axis=1).ravel()
-        k = int(np.argmax(np.abs(inner)))
-        free = (np.delete(e / e[i], i), np.delete(e_ / e_[j], j), np.delete(inner / inner[k], k))
-        return MapsF(f"maps_{i}{j}{k}", np.concatenate(free))
+        inner = np.delete(np.delete(F, j, axis=0), i, axis=1)
+        row, column = np.divmod(int(np.argmax(np.abs(inner))), 2)
+        axes1 = _leading(int(np.delete(range(3), i)[column]), i)
+        axes2 = _leading(int(np.delete(range(3), j)[row]), j)
+        e, e_, F = e[[*axes1]], e_[[*axes2]], F[np.ix_(axes2, axes1)]
+        free = (e[:2] / e[2], e_[:2] / e_[2], F[:2, :2].ravel()[1:] / F[0, 0])
+        return MapsF(axes1, axes2, np.concatenate(free))
 
     def fundamental(self, estimate: MapsF) -> Array:
         """Return F."""
@@ -237,11 +242,29 @@ class Maps:
 
     def retract(self, estimate: MapsF, delta: Array) -> MapsF:
         """Return the updated matrix in the chart that suits it best."""
-        return self.start(self.fundamental(MapsF(estimate.chart, estimate.parameters + delta)))
+        return self.start(self.fundamental(estimate._replace(parameters=estimate[2] + delta)))
 
     def _all(self, estimate: MapsF) -> tuple[Array, Array, Array, Array, Array]:
-        F, dF, d2F, P2, dP2 = getattr(self._kernels, estimate.chart)(estimate.parameters)
-        return F, dF, d2F, P2, dP2
+        """Return F, dF, d2F, P2, dP2 with their axes put back in the order of the images'."""
+        axes1, axes2, parameters = estimate
+        F, dF, d2F, P2, dP2 = self._kernels.maps(parameters)
+        back1, back2 = np.argsort(axes1), np.argsort(axes2)
+        entries = np.ix_(back2, back1)
+        # [S' e']_x = det(S') S' [e']_x S'^T: an odd order turns the sign of [e']_x F.
+        signs = np.array([*3 * [np.linalg.det(np.eye(3)[back2])], 1.0])
+        rows = np.ix_(back2, [*back1, 3])
+        return (
+            F[entries],
+            dF.reshape(3, 3, 7)[entries].reshape(9, 7),
+            d2F.reshape(3, 3, 7, 7)[entries].reshape(9, 7, 7),
+            P2[rows] * signs,
+            (dP2.reshape(3, 4, 7)[rows] * signs[:, None]).reshape(12, 7),
+        )
+
+
+def _leading(first: int, last: int) -> tuple[int, ...]:
+    """Return the order of three axes that begins and ends with the given ones."""
+    return first, 3 - first - last, last
 
 
 class ParFree:
