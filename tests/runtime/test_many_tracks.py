@@ -253,3 +253,62 @@ class TestReconstruction:
         np.testing.assert_allclose(found.project(tracks), expected, rtol=1e-12)
         squares = np.sum((tracks.xy - expected) ** 2)
         assert found.rms_px(tracks) == pytest.approx(np.sqrt(squares / 48), rel=1e-12)
+
+
+def _twice_seen() -> dict[str, object]:
+    rng = np.random.default_rng(8)
+    view, point = np.divmod(np.arange(40), 20)
+    again = rng.choice(40, 9)
+    weights = rng.uniform(0.0, 2.0, 49)
+    weights[[again[0], 40]] = 0.0
+    rows = np.concatenate([np.arange(40), again])
+    return {
+        "view": view[rows],
+        "point": point[rows],
+        "xy": rng.normal(size=(49, 2)),
+        "weights": weights,
+    }
+
+
+def test_merged_tracks_cost_the_same_up_to_a_constant_whatever_is_predicted() -> None:
+    tracks = eg.Tracks(**_twice_seen(), repeated=True, names=["a", "b"])
+    merged, constant = tracks.merged()
+    assert (tracks.n_repeated, len(merged), merged.n_repeated, merged.names) == (
+        *(9, 40, 0),
+        ("a", "b"),
+    )
+    for seed in range(3):
+        prediction = np.random.default_rng(seed).normal(size=(2, 20, 2))
+        costs = [
+            0.5 * t.weights @ np.sum((t.xy - prediction[t.view, t.point]) ** 2, axis=1)
+            for t in (tracks, merged)
+        ]
+        assert costs[0] == pytest.approx(costs[1] + constant, rel=1e-13)
+
+
+def test_a_second_sighting_is_no_second_view() -> None:
+    given = _twice_seen()
+    with pytest.raises(eg.ArgumentError, match="twice"):
+        eg.Tracks(**given)
+    lone = {"view": [*given["view"], 0, 0], "point": [*given["point"], 20, 20]}
+    with pytest.raises(eg.ArgumentError, match="20 has fewer than 2"):
+        eg.Tracks(**lone, xy=np.zeros((51, 2)), repeated=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("names", ["a", "a"]),
+        ("names", ["a"]),
+        ("names", ["a", ""]),
+        ("sizes", [[640, 480]]),
+        ("sizes", [[640, 0], [1, 1]]),
+        ("sizes", np.ones((2, 2))),
+        ("colours", np.full((20, 3), 256)),
+        ("colours", np.zeros((19, 3), int)),
+    ],
+)
+def test_labels_that_do_not_fit_are_refused_by_name(name: str, value: object) -> None:
+    with pytest.raises(eg.ArgumentError) as refused:
+        eg.Tracks(**_twice_seen(), repeated=True, **{name: value})
+    assert refused.value.argument == name

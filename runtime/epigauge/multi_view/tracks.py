@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from epigauge._arguments import MAX_PX, MIN_PX, as_array, as_double, as_weights
 from epigauge.errors import ArgumentError
+from epigauge.multi_view.labels import image_sizes, point_colours, view_names
 
 __all__ = ["Reconstruction", "Tracks"]
 
@@ -35,21 +37,37 @@ class Tracks:
         Numbers of views and points; by default the largest index plus one.
     weights : array_like, shape (N,), optional
         Factor of each squared residual.
+    names : sequence of str, optional
+        Names of the views, as those of their files; all different.
+    sizes : array_like of int, shape (n_views, 2), optional
+        Width and height of each image in pixels.
+    colours : array_like of int, shape (n_points, 3), optional
+        Red, green, blue of each point, 0 to 255.
+    repeated : bool
+        Accept several observations of a point in one view, as COLMAP does.
+    min_points : int
+        Observations that a view needs: 6 for a projective camera, fewer for a calibrated one.
+    source : object, optional
+        What the file they come from said beyond this, for who writes them back.
 
     Attributes
     ----------
     view, point, xy, weights : ndarray
         The same, sorted by point, then view; read-only.
+    names, sizes, colours, source
+        As given, or None.
     order : ndarray of int, shape (N,)
         Row of the input that each sorted row comes from.
+    n_repeated : int
+        Observations of a point beyond the first in the same view.
 
     Raises
     ------
     ArgumentError
         On bad shapes, NaN, indices out of range or never used, a (view, point) pair given twice, a
-        point seen in fewer than 2 views, a view with fewer than 6 points, and tracks that fall
-        into parts without a common point; the message names rows. `Tracks.pruned` drops what is
-        too weak instead.
+        point seen in fewer than 2 views, a view with fewer than 6 points, tracks that fall
+        into parts without a common point, and names, sizes or colours of another number; the
+        message names rows. `Tracks.pruned` drops what is too weak instead.
     """
 
     def __init__(
@@ -60,6 +78,13 @@ class Tracks:
         n_views: int | None = None,
         n_points: int | None = None,
         weights: ArrayLike | None = None,
+        *,
+        names: Sequence[str] | None = None,
+        sizes: ArrayLike | None = None,
+        colours: ArrayLike | None = None,
+        repeated: bool = False,
+        min_points: int = MIN_POINTS,
+        source: object = None,
     ) -> None:
         views, points = _indices("view", view), _indices("point", point)
         pixels = as_array("xy", xy, "an (N, 2) array")
@@ -86,9 +111,14 @@ class Tracks:
         self.xy: Array = np.ascontiguousarray(pixels[self.order])
         w = np.ones(len(views)) if weights is None else as_weights(weights, len(views))
         self.weights: Array = w[self.order]
-        self._check()
+        self.source = source
+        self.n_repeated = int(self._again().sum())
+        self._check(repeated, min_points)
         for array in (self.order, self.view, self.point, self.xy, self.weights):
             array.setflags(write=False)
+        self.names = None if names is None else view_names(names, self.n_views)
+        self.sizes = None if sizes is None else image_sizes(sizes, self.n_views)
+        self.colours = None if colours is None else point_colours(colours, self.n_points)
 
     @classmethod
     def pruned(
@@ -140,21 +170,62 @@ class Tracks:
     def __repr__(self) -> str:
         return f"Tracks({self.n_views} views, {self.n_points} points, {len(self)} observations)"
 
-    def _check(self) -> None:
-        pairs = (np.diff(self.point) == 0) & (np.diff(self.view) == 0)
-        if pairs.any():
-            k = int(np.argmax(pairs))
+    def merged(self) -> tuple[Tracks, float]:
+        """Put observations of one point in one view together: their mean, with their weights' sum.
+
+        Returns
+        -------
+        tracks : Tracks
+            One observation of a point in a view.
+        constant : float
+            With residuals ``xy - prediction``, half their weighted sum of squares is that of the
+            new tracks plus this, whatever is predicted: both have the same least squares solution.
+        """
+        if not self.n_repeated:
+            return self, 0.0
+        first = np.flatnonzero(~self._again())
+        count = np.diff([*first, len(self)])
+        weights = np.add.reduceat(self.weights, first)
+        # Weights of zero, if all of a place are, leave the plain mean.
+        shares = np.where(np.repeat(weights == 0.0, count), 1.0, self.weights)
+        xy = np.add.reduceat(shares[:, None] * self.xy, first)
+        xy /= np.add.reduceat(shares, first)[:, None]
+        away = self.xy - np.repeat(xy, count, axis=0)
+        constant = 0.5 * float(self.weights @ np.sum(away**2, axis=1))
+        tracks = Tracks(
+            self.view[first],
+            self.point[first],
+            xy,
+            self.n_views,
+            self.n_points,
+            weights,
+            names=self.names,
+            sizes=self.sizes,
+            colours=self.colours,
+            min_points=1,
+        )
+        return tracks, constant
+
+    def _again(self) -> NDArray[np.bool_]:
+        """Return which sorted rows have the view and the point of the row before."""
+        again = (np.diff(self.point) == 0) & (np.diff(self.view) == 0)
+        return np.concatenate([[False], again])
+
+    def _check(self, repeated: bool, min_points: int) -> None:
+        if self.n_repeated and not repeated:
+            k = int(np.argmax(self._again())) - 1
             rows = f"rows {self.order[k]} and {self.order[k + 1]}"
             raise ArgumentError(
                 "view, point",
                 f"name view {self.view[k]}, point {self.point[k]} twice ({rows})",
-                "one observation of a point in a view",
+                "one observation of a point in a view, or repeated=True",
             )
         for name, indices, least in (
             ("point", self.point, MIN_VIEWS),
-            ("view", self.view, MIN_POINTS),
+            ("view", self.view, min_points),
         ):
-            counts = np.bincount(indices, minlength=getattr(self, f"n_{name}s"))
+            once = indices[~self._again()]
+            counts = np.bincount(once, minlength=getattr(self, f"n_{name}s"))
             weak = np.flatnonzero(counts < least)
             if len(weak):
                 named = ", ".join(map(str, weak[:5])) + (", ..." if len(weak) > 5 else "")
