@@ -40,7 +40,8 @@ STATUS = {
     -4: "stopped where the points are not at their minimum for this F: a better start is needed",
     -3: "the cost at the start is not finite",
     -2: "stopped by the callback",
-    -1: "no step reduces the cost any further although lambda is at its ceiling",
+    -1: "stopped short of a minimum: no step reduces the cost, however short, as gross errors or a "
+    "bad start bring about: use a robust loss or another start",
     0: "max_iter trial steps taken without convergence",
     1: "converged: gradient below gtol",
     2: "converged: relative decrease of the cost below ftol",

@@ -24,7 +24,9 @@ from epigauge.multi_view.strategies import (
 )
 from epigauge.multi_view.system import Layout
 from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.verdicts import judged
 from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
+from epigauge.verdicts import FLAGS, usable
 
 __all__ = ["BundleResult", "bundle_adjust"]
 
@@ -59,6 +61,16 @@ class BundleResult:
         Name of the strategy.
     loss_scale_px : float
         Scale of the robust loss; 0 for the linear loss.
+    flags : tuple of str
+        What can be said against it, from `epigauge.verdicts.FLAGS`; `success` is False with one
+        that spoils a reconstruction.
+    rank : int
+        Of the normal matrix: 11 n + 3 m - 15 where the observations determine everything, m being
+        the points with two observations that count.
+    n_behind : int
+        Observations of points behind their camera.
+    rejected : ndarray of bool, shape (N,)
+        Observations that were set aside as gross errors, in the order of the tracks.
     nfev, njev, nit, status, message, success, history
         As in `FundamentalResult`.
     """
@@ -69,6 +81,10 @@ class BundleResult:
     fun: Array = field(repr=False)
     method: str
     loss_scale_px: float
+    flags: tuple[str, ...]
+    rank: int
+    n_behind: int
+    rejected: NDArray[np.bool_] = field(repr=False)
     nfev: int
     njev: int
     nit: int
@@ -243,6 +259,8 @@ def bundle_adjust(
         P, Q = there.inverse().apply(P, Q)
     reconstruction = Reconstruction(frame.cameras_out(P), Q)
     residuals = tracks.xy - reconstruction.project(tracks)
+    rejected = np.zeros(len(tracks), dtype=np.bool_)
+    verdict = judged(tracks, reconstruction, rejected, table, workers)
     return BundleResult(
         reconstruction=reconstruction,
         rms_px=float(np.sqrt(np.mean(residuals**2))),
@@ -250,14 +268,25 @@ def bundle_adjust(
         fun=residuals,
         method=method,
         loss_scale_px=scale_px,
+        flags=verdict.flags,
+        rank=verdict.rank,
+        n_behind=verdict.n_behind,
+        rejected=rejected,
         nfev=outcome.nfev,
         njev=outcome.njev,
         nit=outcome.nit,
         status=outcome.status,
-        message=lm.STATUS[outcome.status],
-        success=outcome.status > 0,
+        message=_message(outcome.status, verdict.flags),
+        success=outcome.status > 0 and usable(verdict.flags, "views"),
         history=outcome.history,
     )
+
+
+def _message(status: int, flags: tuple[str, ...]) -> str:
+    """Return why the adjustment stopped and, where its result must not be used, why not."""
+    spoiling = [name for name in flags if not usable([name], "views")]
+    reasons = [f"{name}: {FLAGS[name].sentence}" for name in spoiling]
+    return "; but ".join([lm.STATUS[status], *reasons])
 
 
 def _measured(tracks: Tracks, frame: Frame, start: Reconstruction) -> Array:

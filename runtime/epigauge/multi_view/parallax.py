@@ -1,0 +1,213 @@
+"""Whether the views show parallax: a flat scene, and a camera that turns or stands still, do not.
+
+Then homographies take each view to every other, and the cameras and points of a reconstruction
+follow the noise. Two views that one homography does not explain are enough to free both of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.multi_view.seen import Seen
+
+__all__ = ["Homographies", "fit_homographies", "parallax_flags"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: Points a pair of views must have in common to be asked, and most that are; partners of a view;
+#: views that are asked, and so many at once.
+_LEAST, _MOST, _PARTNERS, _VIEWS, _AT_ONCE = 12, 200, 3, 50, 5
+
+#: A point is off its homography beyond this many standard deviations of the noise in both images.
+_OFF = 4.0
+
+#: Share of points off that heavy tails and chance explain; below the second, few points fix all.
+_NONE, _FEW = 0.05, 0.1
+
+#: Share of the pairs whose homography, within three standard deviations, may be that of a camera
+#: that turned: beyond it, the camera may only have turned.
+_TURNED = 0.75
+
+#: Reweighted least squares against points off the plane.
+_ROUNDS = 8
+
+
+def parallax_flags(seen: Seen, noise_px: float) -> tuple[str, ...]:
+    """Return "still camera", "planar scene" with or without "pure rotation", or "nearly planar".
+
+    Parameters
+    ----------
+    seen : Seen
+        The observations that count.
+    noise_px : float
+        Standard deviation of a coordinate.
+
+    Returns
+    -------
+    tuple of str
+        Empty where some views show parallax, and where no two have enough points in common to
+        tell.
+    """
+    limit = _OFF * float(np.sqrt(2.0)) * max(noise_px, 1e-9 * float(np.abs(seen.xy).max()))
+    shares: list[Array] = []
+    rotations: list[bool] = []
+    still: list[Array] = []
+    for pairs in _pairs(seen):
+        x1, x2, first = _matches(seen, pairs)
+        fits = fit_homographies(x1, x2, first)
+        share = np.add.reduceat(fits.distances > limit, first[:-1]) / np.diff(first)
+        if (share > _FEW).any():
+            return ()
+        shares.append(share)
+        moved = np.linalg.norm(x2 - x1, axis=1) > limit
+        still.append(np.add.reduceat(moved, first[:-1]) / np.diff(first))
+        rotations += [fits.may_be_rotation(k, noise_px) for k in range(len(pairs))]
+    if not shares:
+        return ()
+    if np.concatenate(still).max() <= _NONE:
+        return ("still camera",)
+    if np.concatenate(shares).max() > _NONE:
+        return ("nearly planar",)
+    turned = np.mean(rotations) >= _TURNED
+    return ("planar scene", "pure rotation") if turned else ("planar scene",)
+
+
+def _pairs(seen: Seen) -> Iterator[Indices]:
+    """Give pairs of views, some at a time: partners with few, some and many points in common.
+
+    Those with few see from far apart. Views are asked at a bounded number of places in a sequence.
+    """
+    n, view, point = seen.n, seen.view, seen.point
+    begin = np.searchsorted(point, np.arange(seen.m + 1))
+    lengths = np.diff(begin)
+    asked = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).astype(np.intp))
+    # Evenly spread from the first few on.
+    stride = -(-len(asked) // _AT_ONCE)
+    for some in (asked[k::stride] for k in range(stride)):
+        chosen: list[tuple[int, int]] = []
+        for i in some.tolist():
+            own = point[view == i]
+            rows = np.repeat(begin[own] - np.cumsum(lengths[own]) + lengths[own], lengths[own])
+            common = np.bincount(view[rows + np.arange(len(rows))], minlength=n)
+            common[i] = 0
+            others = np.flatnonzero(common >= _LEAST)
+            others = others[np.argsort(common[others], kind="stable")]
+            spread = np.linspace(0, len(others) - 1, min(len(others), _PARTNERS))
+            chosen += [(i, k) for k in others[spread.astype(np.intp)].tolist()]
+        if chosen:
+            yield np.array(chosen)
+
+
+def _matches(seen: Seen, pairs: Indices) -> tuple[Array, Array, Indices]:
+    """Return matches of all pairs, and where each begins."""
+    rows: dict[int, Indices] = {}
+    for view in np.unique(pairs).tolist():
+        rows[view] = np.full(seen.m, -1)
+        own = np.flatnonzero(seen.view == view)
+        rows[view][seen.point[own]] = own
+    sides: tuple[list[Array], list[Array]] = [], []
+    for i, k in pairs.tolist():
+        both = np.flatnonzero((rows[i] >= 0) & (rows[k] >= 0))
+        both = both[:: -(-len(both) // _MOST)]
+        sides[0].append(seen.xy[rows[i][both]])
+        sides[1].append(seen.xy[rows[k][both]])
+    first = np.concatenate([[0], np.cumsum([len(part) for part in sides[0]])])
+    return np.concatenate(sides[0]), np.concatenate(sides[1]), first
+
+
+@dataclass(frozen=True)
+class Homographies:
+    """Homographies of groups of matches.
+
+    Attributes
+    ----------
+    H : ndarray, shape (k, 3, 3)
+        In coordinates centred at `centre`, in units of `scale` pixels, of determinant 1.
+    distances : ndarray, shape (m,)
+        Transfer error of each match, in pixels.
+    covariance : ndarray, shape (k, 9, 9)
+        Of the entries of H, for a noise of one unit.
+    scale : float
+        Pixels a unit.
+    """
+
+    H: Array
+    distances: Array
+    covariance: Array
+    scale: float
+
+    def may_be_rotation(self, k: int, noise_px: float) -> bool:
+        """Tell whether a homography could be K R K^-1: tr H = tr H^-1, whatever K (det H = 1)."""
+        H = self.H[k]
+        inverse = np.linalg.inv(H)
+        difference = float(np.trace(H) - np.trace(inverse))
+        # d tr H^-1 = -tr(H^-1 dH H^-1); the determinant stays one, so that scale has no part.
+        gradient = np.eye(3) + (inverse @ inverse).T
+        gradient -= (np.trace(H) + np.trace(inverse)) / 3.0 * inverse.T
+        g = gradient.ravel()
+        noise = np.sqrt(2.0) * noise_px / self.scale
+        deviation = noise * float(np.sqrt(max(g @ self.covariance[k] @ g, 0.0)))
+        return bool(abs(difference) <= 3.0 * deviation)
+
+
+def fit_homographies(x1: Array, x2: Array, first: Indices) -> Homographies:
+    """Fit a homography to each group of matches, robustly: reweighted normal equations (DLT).
+
+    Parameters
+    ----------
+    x1, x2 : ndarray, shape (m, 2)
+        Matches of all groups, in pixels.
+    first : ndarray of int, shape (k + 1,)
+        First match of each group, and m.
+
+    Returns
+    -------
+    Homographies
+        One a group.
+    """
+    both = np.concatenate([x1, x2])
+    centre = both.mean(axis=0)
+    scale = max(float(np.sqrt(np.mean((both - centre) ** 2))), 1e-300)
+    a = np.column_stack([(x1 - centre) / scale, np.ones(len(x1))])
+    b = (x2 - centre) / scale
+    group = np.repeat(np.arange(len(first) - 1), np.diff(first))
+    square = a[:, :, None] * a[:, None, :]
+    terms = np.stack([np.ones(len(a)), *b.T, np.sum(b**2, axis=1)], axis=1)
+    blocks = terms[:, :, None, None] * square[:, None]
+    weights = np.ones(len(a))
+    for _ in range(_ROUNDS):
+        sums = np.add.reduceat(weights[:, None, None, None] * blocks, first[:-1])
+        N = np.zeros((len(first) - 1, 9, 9))
+        N[:, :3, :3] = N[:, 3:6, 3:6] = sums[:, 0]
+        N[:, :3, 6:] = N[:, 6:, :3] = -sums[:, 1]
+        N[:, 3:6, 6:] = N[:, 6:, 3:6] = -sums[:, 2]
+        N[:, 6:, 6:] = sums[:, 3]
+        values, vectors = np.linalg.eigh(N)
+        H = vectors[:, :, 0].reshape(-1, 3, 3)
+        h = np.einsum("mij,mj->mi", H[group], a)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            distances = np.linalg.norm(h[:, :2] / h[:, 2:] - b, axis=1)
+        distances = np.nan_to_num(distances, nan=1e3, posinf=1e3)
+        medians = [np.median(part) for part in np.split(distances, first[1:-1])]
+        typical = np.maximum(np.array(medians), 1e-9)[group]
+        # Algebraic errors are h_3 times geometric ones.
+        depth = h[:, 2] ** 2 / np.repeat(_means(h[:, 2] ** 2, first), np.diff(first))
+        weights = 1.0 / (1.0 + (distances / typical) ** 2) / np.maximum(depth, 1e-6)
+    size = np.cbrt(np.linalg.det(H))
+    size = np.where(np.abs(size) > 1e-12, size, 1.0)
+    inverse = vectors[:, :, 1:] / np.maximum(values[:, None, 1:], 1e-300)
+    typical_depth = _means(h[:, 2] ** 2, first)
+    covariance = inverse @ np.swapaxes(vectors[:, :, 1:], 1, 2)
+    covariance *= (typical_depth / size**2)[:, None, None] * _means(weights**2, first)[
+        :, None, None
+    ]
+    return Homographies(H / size[:, None, None], scale * distances, covariance, scale)
+
+
+def _means(values: Array, first: Indices) -> Array:
+    return np.asarray(np.add.reduceat(values, first[:-1]) / np.diff(first))

@@ -1,0 +1,64 @@
+"""The part of the tracks that a verdict is about."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.multi_view.tracks import MIN_VIEWS, Reconstruction, Tracks
+
+__all__ = ["Seen"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The observations that count, with views and points renumbered.
+
+    Attributes
+    ----------
+    view, point : ndarray of int, shape (N,)
+        New numbers; sorted by point, then view.
+    xy, weights : ndarray, shape (N, 2), (N,)
+        Pixels, and positive factors.
+    P, Q : ndarray, shape (n, 3, 4), (m, 4)
+        Their cameras and points.
+    views : ndarray of int, shape (n,)
+        Old numbers of the views.
+    """
+
+    view: Indices
+    point: Indices
+    xy: Array
+    weights: Array
+    P: Array
+    Q: Array
+    views: Indices
+
+    @property
+    def n(self) -> int:
+        """Return the number of views."""
+        return len(self.P)
+
+    @property
+    def m(self) -> int:
+        """Return the number of points."""
+        return len(self.Q)
+
+    @staticmethod
+    def of(tracks: Tracks, found: Reconstruction, rejected: Mask) -> tuple[Seen, int]:
+        """Return what counts, and how many views lost all that would have."""
+        counts = ~rejected & (tracks.weights > 0.0)
+        # A point needs two observations to be a part of what is judged.
+        lengths = np.bincount(tracks.point[counts], minlength=tracks.n_points)
+        counts &= lengths[tracks.point] >= MIN_VIEWS
+        views, view = np.unique(tracks.view[counts], return_inverse=True)
+        points, point = np.unique(tracks.point[counts], return_inverse=True)
+        before = len(np.unique(tracks.view[tracks.weights > 0.0]))
+        arrays = tracks.xy[counts], tracks.weights[counts], found.P[views], found.Q[points]
+        return Seen(view, point, *arrays, views), before - len(views)

@@ -1,0 +1,264 @@
+"""What can be said against a reconstruction: its rank, its flags, points behind cameras.
+
+An adjustment always ends somewhere. Whether the observations determine it is counted and measured
+in the normal matrix: of N, all but the gauge must be of full rank. Where noise hides a degenerate
+scene from N, two views at a time tell: a flat scene or a camera that turns leaves homographies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.kernels import Table
+from epigauge.multi_view.coupling import Reduced, solved
+from epigauge.multi_view.dampings import Covariant
+from epigauge.multi_view.gauge import normalized
+from epigauge.multi_view.initialize import Frame
+from epigauge.multi_view.parallax import parallax_flags
+from epigauge.multi_view.problem import BundleProblem, BundleState
+from epigauge.multi_view.seen import Seen
+from epigauge.multi_view.system import BundleSystem, Layout
+from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.two_view.losses import Loss, robust_scale
+from epigauge.verdicts import ordered
+
+__all__ = ["Verdict", "behind", "judged", "missing_by_count"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: Parameters of a camera and a point without their scales, and dimension of the changes of basis.
+_CAMERA, _POINT, _GAUGE = 11, 3, 15
+
+#: Relative matches of two views determine their F, and nothing more.
+_PAIR = 7
+
+#: An eigenvalue of N below this, where W of the covariant damping is one, is rounding.
+_ROUNDING = 1e-11
+
+#: Standard deviation of the depth and image of a camera's points, as a share of their size, above
+#: which the noise leaves a change of the cameras open.
+_WEAK = 0.3
+
+#: Up to so many cameras all eigenvalues are computed; of more, the smallest, by iterations.
+_FEW, _COLUMNS, _ITERATIONS = 12, 4, 3
+
+#: Shift with which a singular matrix is factored; larger where conjugate gradients solve.
+_SHIFT, _SHIFT_ITERATIVE = 1e-12, 1e-5
+
+#: Share of the observations that may lie behind a camera before it is told: chance, and far points.
+_BEHIND = 0.01
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is to be known of a reconstruction before it is used.
+
+    Attributes
+    ----------
+    flags : tuple of str
+        Names from `epigauge.verdicts.FLAGS`.
+    rank : int
+        Of the normal matrix; 11 n + 3 m - 15 where all is determined, n and m being the numbers of
+        views and points that count, these with two observations.
+    n_behind : int
+        Observations of points behind the camera, signs of cameras and points being chosen best.
+    """
+
+    flags: tuple[str, ...]
+    rank: int
+    n_behind: int
+
+
+def judged(
+    tracks: Tracks, found: Reconstruction, rejected: Mask, kernels: Table, workers: int = 1
+) -> Verdict:
+    """Judge an adjusted reconstruction.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Observations; those of weight zero do not count.
+    found : Reconstruction
+        Cameras and points, at the minimum.
+    rejected : ndarray of bool, shape (N,)
+        Observations that do not count either.
+    kernels : Table
+        Backend.
+    workers : int
+        Threads.
+
+    Returns
+    -------
+    Verdict
+        Flags, rank, and the number of observations behind the cameras.
+    """
+    seen, lost = Seen.of(tracks, found, rejected)
+    full = _CAMERA * (seen.n + lost) + _POINT * seen.m - _GAUGE
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        h = np.einsum("nij,nj->ni", seen.P[seen.view], seen.Q[seen.point])
+        distances = np.linalg.norm(h[:, :2] / h[:, 2:] - seen.xy, axis=1)
+    n_behind = behind(seen, h[:, 2])
+    if not np.isfinite(distances).all():  # a point in a focal plane: there is nothing to measure
+        return Verdict(("undetermined",), 0, n_behind)
+    open_directions, weakest = _open_directions(seen, Frame.of(tracks), kernels, workers)
+    missing = max(missing_by_count(seen), open_directions) + _CAMERA * lost
+    N = len(distances)
+    redundancy = max(2 * N - full, 1) / (2 * N)
+    # Of two normal coordinates, the median distance is 1.1774 standard deviations.
+    noise_px = robust_scale(distances) / 1.4826 / 1.1774 / float(np.sqrt(redundancy))
+    information = max(weakest, 1e-300) * N / seen.n
+    deviation = noise_px / Frame.of(tracks).scale / float(np.sqrt(information))
+    raised = set(parallax_flags(seen, noise_px))
+    if missing:
+        raised.add("undetermined")
+    elif deviation > _WEAK:
+        raised.add("weak geometry")
+    if n_behind > _BEHIND * N:
+        raised.add("behind the cameras")
+    return Verdict(ordered(raised), full - missing, n_behind)
+
+
+def missing_by_count(seen: Seen) -> int:
+    """Return how many parameters lack an equation, whatever the measurements: a lower bound.
+
+    c points in the same s views give those cameras min(c (2 s - 3), 11 s - 15) equations; two
+    views, as many as F has parameters. All cameras need 11 n - 15, and each one 11, of which points
+    that two other views see give two apiece.
+    """
+    # Points are told apart by the views that see them: sums of one random number a view.
+    marks = np.random.default_rng(0).integers(0, 2**62, seen.n, dtype=np.uint64)
+    first = np.flatnonzero(np.diff(seen.point, prepend=-1))
+    lengths = np.diff(np.append(first, len(seen.point)))
+    sums = np.add.reduceat(marks[seen.view], first)
+    _, shown, sizes = np.unique(sums, return_index=True, return_counts=True)
+    s = lengths[shown]
+    given = np.minimum(sizes * (2 * s - _POINT), _CAMERA * s - _GAUGE)
+    total = _CAMERA * seen.n - _GAUGE - int(np.sum(given))
+
+    to_camera = np.where(s == 2, np.minimum(sizes, _PAIR), np.minimum(2 * sizes, _CAMERA))
+    # One point of each kind stands for all.
+    of_kind = np.zeros(len(first))
+    of_kind[shown] = to_camera
+    own = np.bincount(seen.view, weights=np.repeat(of_kind, lengths))
+    return max(total, int(_CAMERA - own.min()) if seen.n > 2 else 0, 0)
+
+
+def _open_directions(seen: Seen, frame: Frame, kernels: Table, workers: int) -> tuple[int, float]:
+    """Return how many directions beside the gauge N leaves open, and its least other eigenvalue.
+
+    In parameters in which W of the covariant damping is one, for which the basis does not matter.
+    """
+    layout = Layout(seen.view, seen.point, seen.n, seen.m)
+    origins = frame.origins[seen.views]
+    own = Frame(origins, frame.scale)
+    q = own.points_in(seen.xy, seen.view)
+    P = own.cameras_in(seen.P)
+    try:
+        problem = BundleProblem(kernels, layout, q, seen.weights, Loss(), workers=workers)
+        home = normalized().transformation(P, seen.Q)
+        P, Q = home.apply(P, seen.Q)
+        system = problem.linearize(BundleState(P, Q, 0.0, problem))
+        return _measured(system, problem, P, Q)
+    except np.linalg.LinAlgError:
+        return 1, 0.0
+
+
+def _measured(
+    system: BundleSystem, problem: BundleProblem, P: Array, Q: Array
+) -> tuple[int, float]:
+    W = Covariant().matrix(system)  # type: ignore[arg-type]
+    # A point whose lines of sight are one leaves W singular, too.
+    lifted = [blocks + 1e-12 * _mean_diagonal(blocks) * np.eye(blocks.shape[1]) for blocks in W]
+    roots = [np.swapaxes(np.linalg.cholesky(blocks), 1, 2) for blocks in lifted]
+    white = system.transformed(*(np.asarray(np.linalg.inv(root)) for root in roots))
+    p, q, moves = _freedom(problem.kernels, P, Q, roots)
+    white = white.damped(p[:, :, None] * p[:, None, :], q[:, :, None] * q[:, None, :])
+    open_points, V = _grounded(white.V)
+    white = replace(white, V=V)
+    coupling = white.coupling
+    roots_V = coupling.inverse_roots(white.V)
+    n, a = p.shape
+    reduced = coupling.reduced(white.U, roots_V)
+    if n <= _FEW:
+        S = reduced.matrix() + moves @ moves.T
+        values = np.linalg.eigvalsh(S)
+    else:
+        shift = _SHIFT if reduced.direct else _SHIFT_ITERATIVE
+        shifted = coupling.reduced(white.U + shift * np.eye(a), roots_V)
+        columns = _COLUMNS if reduced.direct else 2
+        while True:
+            values = _least(shifted, shift, moves, columns)
+            if columns >= n * a // 2 or not reduced.direct or values[-1] > _ROUNDING:
+                break
+            columns *= 4
+    open_cameras = int(np.count_nonzero(values <= _ROUNDING))
+    return open_cameras + open_points, float(max(values[0], 0.0))
+
+
+def _freedom(kernels: Table, P: Array, Q: Array, roots: list[Array]) -> tuple[Array, Array, Array]:
+    """Return unit directions of the scales, and the changes of basis as S knows them, (12 n, 15).
+
+    What N does not see, S does not see in the cameras alone.
+    """
+    p = np.einsum("nij,nj->ni", roots[0], P.reshape(-1, 12))
+    q = np.einsum("nij,nj->ni", roots[1], Q)
+    p, q = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (p, q))
+    cameras = roots[0] @ kernels.camera_generators(P.transpose(1, 2, 0)).transpose(2, 0, 1)
+    cameras = cameras - p[:, :, None] * np.einsum("ni,nik->nk", p, cameras)[:, None]
+    # The identity only changes scales: one of the sixteen columns is dependent.
+    moves = np.linalg.svd(cameras.reshape(-1, 16), full_matrices=False)[0][:, :_GAUGE]
+    return p, q, np.asarray(moves)
+
+
+def _least(shifted: Reduced, shift: float, moves: Array, columns: int) -> Array:
+    """Return the least eigenvalues of S beside the gauge, from above: inverse iterations."""
+    n, a, _ = shifted.diagonal().shape
+    X = np.random.default_rng(0).standard_normal((n * a, columns))
+    for _ in range(_ITERATIONS):
+        X = np.linalg.qr(X - moves @ (moves.T @ X))[0]
+        Y = solved(shifted, X.reshape(n, a, columns)).reshape(n * a, columns)
+        Y -= moves @ (moves.T @ Y)
+        # X^T S^-1 X has the inverse eigenvalues: Ritz values without a product with S.
+        inverse = np.linalg.eigvalsh(0.5 * (X.T @ Y + Y.T @ X))[::-1]
+        X = Y
+    return np.asarray(1.0 / np.maximum(inverse, 1e-300) - shift)
+
+
+def _grounded(V: Array) -> tuple[int, Array]:
+    """Return how many directions of single points are open, and the blocks with these closed."""
+    factors = np.linalg.cholesky(V + 1e-14 * np.eye(4))
+    diagonal = np.einsum("nii->ni", factors)
+    thin = np.flatnonzero(diagonal.min(axis=1) ** 2 <= 1e3 * _ROUNDING)
+    values, vectors = np.linalg.eigh(V[thin])
+    open_ = values <= _ROUNDING
+    V = V.copy()
+    V[thin] += (vectors * open_[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    return int(np.count_nonzero(open_)), V
+
+
+def _mean_diagonal(blocks: Array) -> Array:
+    return np.asarray(np.einsum("nii->n", blocks) / blocks.shape[1])[:, None, None]
+
+
+def behind(seen: Seen, third: Array) -> int:
+    """Return the number of observations whose point is behind the camera.
+
+    The third coordinate of P Q is the depth times the scales of camera and point: there are signs
+    of these for which all are positive, or else some point is behind a camera that sees it.
+    """
+    view, point, sign = seen.view, seen.point, np.sign(third)
+    of_view = np.zeros(seen.n)
+    of_view[np.argmax(np.bincount(view))] = 1.0
+    before = -1
+    for _ in range(seen.n + 20):
+        of_point = np.sign(np.bincount(point, weights=sign * of_view[view]))
+        of_view = np.sign(np.bincount(view, weights=sign * of_point[point]))
+        wrong = int(np.count_nonzero(sign * of_view[view] * of_point[point] <= 0.0))
+        if wrong in (0, before):
+            break
+        before = wrong
+    return wrong
