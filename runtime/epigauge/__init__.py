@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge import casadi, colmap, datasets, interop, kernels, verdicts
+    from epigauge.bundle.priors import IntrinsicPrior, PointPrior, PositionPrior
     from epigauge.cameras import Cameras, MetricReconstruction
     from epigauge.errors import ArgumentError, BackendError, EpigaugeError, FileFormatError
     from epigauge.images import ImageMatches, load_image, match_images
@@ -58,9 +59,12 @@ __all__ = [
     "FundamentalBatch",
     "FundamentalResult",
     "ImageMatches",
+    "IntrinsicPrior",
     "Matches",
     "MetricReconstruction",
     "MultiViewScene",
+    "PointPrior",
+    "PositionPrior",
     "Reconstruction",
     "ReconstructionCovariance",
     "RobustResult",
@@ -103,6 +107,7 @@ __all__ = [
 
 #: Modules below this package, and the public names that they define.
 _WHERE = {
+    "bundle.priors": "IntrinsicPrior PointPrior PositionPrior",
     "cameras": "Cameras MetricReconstruction",
     "errors": "ArgumentError BackendError EpigaugeError FileFormatError",
     "images": "ImageMatches load_image match_images",

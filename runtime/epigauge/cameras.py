@@ -56,6 +56,8 @@ class CameraModel:
         Dimension of the group of space that changes no image: 7 for similarities.
     metric : bool
         Whether a camera has a rotation and a position.
+    homogeneous : bool
+        Whether points are homogeneous: they and the cameras have scales that change no image.
     """
 
     name: str
@@ -67,6 +69,7 @@ class CameraModel:
     point_size: int
     gauge_dimension: int
     metric: bool
+    homogeneous: bool
 
     @property
     def focal(self) -> tuple[int, ...]:

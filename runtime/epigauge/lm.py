@@ -77,7 +77,7 @@ class System(Protocol):
     def largest(self) -> float:
         """Return the largest diagonal entry of the Hessian."""
 
-    def predicted(self, step: Array) -> float:
+    def predicted(self, step: Any) -> float:
         """Return the decrease of the cost that the quadratic model promises for a step."""
 
     def decrement(self) -> float:
@@ -87,8 +87,9 @@ class System(Protocol):
 class Problem(Protocol[S]):
     """A cost function over estimates of any kind."""
 
-    #: A cost this low is rounding error.
-    floor: float
+    @property
+    def floor(self) -> float:
+        """Return a cost so low that it is rounding error."""
 
     def evaluate(self, estimate: Any) -> S:
         """Return the state of an estimate; a cost of infinity rejects it."""
@@ -96,7 +97,7 @@ class Problem(Protocol[S]):
     def linearize(self, state: S) -> System:
         """Return the linear system at a state."""
 
-    def retract(self, state: S, step: Array) -> Any:
+    def retract(self, state: S, step: Any) -> Any:
         """Return the estimate that a step leads to."""
 
 
@@ -106,8 +107,8 @@ class Damping(Protocol):
     def start(self, system: Any) -> float:
         """Return the first lambda."""
 
-    def step(self, system: Any, lam: float) -> Array:
-        """Return the step."""
+    def step(self, system: Any, lam: float) -> Any:
+        """Return the step: a vector, or what NumPy makes one of."""
 
 
 class Schedule(Protocol):

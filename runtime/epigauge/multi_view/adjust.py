@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from epigauge import kernels, lm
 from epigauge._arguments import as_choice, as_count, as_positive
+from epigauge.bundle.metric import adjust_metric
+from epigauge.bundle.priors import Prior
+from epigauge.cameras import MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.multi_view import dampings, far
 from epigauge.multi_view.gauge import GAUGES, Gauge, five_points, identity, normalized
@@ -24,7 +27,7 @@ from epigauge.multi_view.strategies import (
 )
 from epigauge.multi_view.system import Layout
 from epigauge.multi_view.tracks import Reconstruction, Tracks
-from epigauge.multi_view.verdicts import judged
+from epigauge.multi_view.verdicts import Verdict, judged
 from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
 from epigauge.verdicts import FLAGS, usable
 
@@ -49,8 +52,8 @@ class BundleResult:
 
     Attributes
     ----------
-    reconstruction : Reconstruction
-        Cameras and points; with method "covariant" in the basis of the start.
+    reconstruction : Reconstruction or MetricReconstruction
+        Cameras and points, of the kind of the start; with method "covariant" in its basis.
     rms_px : float
         sqrt(sum of squared residual coordinates / (2 N)).
     cost : float
@@ -68,14 +71,15 @@ class BundleResult:
         Of the normal matrix: 11 n + 3 m - 15 where the observations determine everything, m being
         the points with two observations that count.
     n_behind : int
-        Observations of points behind their camera.
+        Observations of points that do not lie in front of their camera; they keep the residual that
+        the camera's formula gives.
     rejected : ndarray of bool, shape (N,)
         Observations that were set aside as gross errors, in the order of the tracks.
     nfev, njev, nit, status, message, success, history
         As in `FundamentalResult`.
     """
 
-    reconstruction: Reconstruction = field(repr=False)
+    reconstruction: Any = field(repr=False)
     rms_px: float
     cost: float
     fun: Array = field(repr=False)
@@ -96,8 +100,12 @@ class BundleResult:
 
 def bundle_adjust(
     tracks: Tracks,
-    start: Reconstruction | None = None,
+    start: Reconstruction | MetricReconstruction | None = None,
     *,
+    refine: str | Sequence[str] = "all",
+    fixed_views: Iterable[int] = (),
+    fixed_points: Iterable[int] = (),
+    priors: Iterable[Prior] | None = None,
     method: str = "covariant",
     gauge: Gauge | type[Gauge] | None = None,
     gauge_mode: str = "explicit",
@@ -114,14 +122,26 @@ def bundle_adjust(
     backend: str | None = None,
     callback: Callable[[lm.Row], object] | None = None,
 ) -> BundleResult:
-    """Minimise the reprojection error of cameras and points, up to a projective basis.
+    """Minimise the reprojection error of cameras and points.
+
+    The start decides what cameras are: a `Reconstruction` has projective ones, known up to a change
+    of basis; a `MetricReconstruction` those of its camera model, known up to a similarity.
 
     Parameters
     ----------
     tracks : Tracks
         Observations.
-    start : Reconstruction, optional
+    start : Reconstruction or MetricReconstruction, optional
         Where to begin, in any basis; by default `initialize(tracks)`.
+    refine : "all", "pose" or sequence of str
+        Intrinsics of a metric start to be refined beside rotations, positions and points: all of
+        them, none, or those named, such as ``("f", "k1")``. "f" of a model with fx and fy changes
+        both and keeps their ratio. Views of one camera share its intrinsics.
+    fixed_views, fixed_points : iterable of int
+        Of a metric start: views whose rotation and position, and points that stay where they are.
+    priors : iterable, optional
+        What is known of a metric reconstruction beside the images: `PositionPrior`,
+        `IntrinsicPrior` and `PointPrior`, in the frame of the start.
     method : str
         Strategy: "covariant" (default) gives the same iterations in every basis; "free",
         "hartley", "bartoli", "faugeras", "mclauchlan", "kanatani" and "gauge_invariant" are those
@@ -180,6 +200,11 @@ def bundle_adjust(
     References
     ----------
     .. [B03] A. Bartoli, "Towards gauge invariant bundle adjustment", ICCV 2003.
+
+    Examples
+    --------
+    >>> tracks, scene = eg.load_scene("sparse/0")  # doctest: +SKIP
+    >>> eg.bundle_adjust(tracks, scene, refine=("f", "k"), fixed_views=[0])  # doctest: +SKIP
     """
     strategy = STRATEGIES[as_choice("method", method, STRATEGIES)]
     as_choice("gauge_mode", gauge_mode, ("explicit", "implicit"))
@@ -206,6 +231,29 @@ def bundle_adjust(
             )
     workers = as_count("workers", workers)
     stopping = lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter)
+    if isinstance(start, MetricReconstruction):
+        scale_px = _loss_scale(loss, loss_scale_px, tracks, start)
+        found = adjust_metric(
+            tracks,
+            start,
+            refine=refine,
+            fixed_views=fixed_views,
+            fixed_points=fixed_points,
+            priors=priors,
+            method=method,
+            damping=damping,
+            embedded=embedded,
+            schedule=_SCHEDULES[schedule](),
+            loss=Loss(loss, scale_px),
+            stopping=stopping,
+            workers=workers,
+            backend=backend,
+            callback=callback,
+        )
+        rejected = np.zeros(len(tracks), dtype=np.bool_)
+        metric = found.reconstruction, found.outcome, 1.0, found.verdict
+        return _result(tracks, *metric, rejected, method, scale_px)
+    _check_projective(refine, fixed_views, fixed_points, priors)
     table = kernels.table(backend)
     if start is None:
         start = initialize(tracks, backend=backend)
@@ -258,13 +306,29 @@ def bundle_adjust(
     if first is home:
         P, Q = there.inverse().apply(P, Q)
     reconstruction = Reconstruction(frame.cameras_out(P), Q)
-    residuals = tracks.xy - reconstruction.project(tracks)
     rejected = np.zeros(len(tracks), dtype=np.bool_)
     verdict = judged(tracks, reconstruction, rejected, table, workers)
+    return _result(
+        tracks, reconstruction, outcome, frame.scale**2, verdict, rejected, method, scale_px
+    )
+
+
+def _result(
+    tracks: Tracks,
+    reconstruction: Reconstruction | MetricReconstruction,
+    outcome: lm.Outcome[Any],
+    unit: float,
+    verdict: Verdict,
+    rejected: NDArray[np.bool_],
+    method: str,
+    scale_px: float,
+) -> BundleResult:
+    """Return the result; `unit` is that of the outcome's cost in square pixels."""
+    residuals = tracks.xy - reconstruction.project(tracks)
     return BundleResult(
         reconstruction=reconstruction,
         rms_px=float(np.sqrt(np.mean(residuals**2))),
-        cost=outcome.state.cost * frame.scale**2,
+        cost=outcome.state.cost * unit,
         fun=residuals,
         method=method,
         loss_scale_px=scale_px,
@@ -287,6 +351,18 @@ def _message(status: int, flags: tuple[str, ...]) -> str:
     spoiling = [name for name in flags if not usable([name], "views")]
     reasons = [f"{name}: {FLAGS[name].sentence}" for name in spoiling]
     return "; but ".join([lm.STATUS[status], *reasons])
+
+
+def _check_projective(refine: Any, *others: Any) -> None:
+    """Refuse what a projective start has no use for."""
+    names = ("fixed_views", "fixed_points", "priors")
+    for name, value in zip(names, others, strict=True):
+        if value is not None and len(list(value)):
+            raise ArgumentError(name, "is given with a projective start", "a metric start")
+    if not (isinstance(refine, str) and refine == "all"):
+        raise ArgumentError(
+            "refine", f"is {refine!r:.60} with a projective start", "a metric start"
+        )
 
 
 def _measured(tracks: Tracks, frame: Frame, start: Reconstruction) -> Array:
@@ -321,7 +397,10 @@ def _problem(
 
 
 def _loss_scale(
-    loss: str, loss_scale_px: float | str, tracks: Tracks, start: Reconstruction
+    loss: str,
+    loss_scale_px: float | str,
+    tracks: Tracks,
+    start: Reconstruction | MetricReconstruction,
 ) -> float:
     if loss == "linear":
         return 0.0

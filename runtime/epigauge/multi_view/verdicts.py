@@ -25,7 +25,7 @@ from epigauge.multi_view.tracks import Reconstruction, Tracks
 from epigauge.two_view.losses import Loss, robust_scale
 from epigauge.verdicts import ordered
 
-__all__ = ["Verdict", "behind", "judged", "missing_by_count"]
+__all__ = ["BEHIND", "Verdict", "behind", "judged", "missing_by_count"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -50,7 +50,7 @@ _FEW, _COLUMNS, _ITERATIONS = 12, 4, 3
 _SHIFT, _SHIFT_ITERATIVE = 1e-12, 1e-5
 
 #: Share of the observations that may lie behind a camera before it is told: chance, and far points.
-_BEHIND = 0.01
+BEHIND = 0.01
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def judged(
         raised.add("undetermined")
     elif deviation > _WEAK:
         raised.add("weak geometry")
-    if n_behind > _BEHIND * N:
+    if n_behind > BEHIND * N:
         raised.add("behind the cameras")
     return Verdict(ordered(raised), full - missing, n_behind)
 

@@ -1,0 +1,48 @@
+"""Which linearizer evaluates a problem: the fastest that the back end offers for its camera."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.bundle.linearizer import Linearizer
+from epigauge.bundle.numpy_linearizer import NumpyLinearizer
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.cameras import CameraModel
+from epigauge.kernels import Table
+from epigauge.two_view.losses import Loss
+
+__all__ = ["linearizer_for"]
+
+Array = NDArray[np.float64]
+
+
+def linearizer_for(
+    model: CameraModel,
+    kernels: Table,
+    graph: ObservationGraph,
+    q: Array,
+    weights: Array,
+    loss: Loss,
+    workers: int = 1,
+) -> Linearizer:
+    """Return what evaluates observations of cameras of a model.
+
+    Parameters
+    ----------
+    model : CameraModel
+        The camera.
+    kernels : Table
+        Back end.
+    graph : ObservationGraph
+        Which observation belongs to what.
+    q : ndarray, shape (2, N)
+        Measurements.
+    weights : ndarray, shape (N,)
+        Factor of each squared residual.
+    loss : Loss
+        Applied to each squared residual.
+    workers : int
+        Threads to use where the back end can.
+    """
+    return NumpyLinearizer(model, kernels, graph, q, weights, loss)

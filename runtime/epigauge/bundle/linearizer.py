@@ -1,0 +1,188 @@
+"""What the engine asks of an evaluation: costs, normal equations, products with them.
+
+Two classes answer: `NumpyLinearizer` over the generated kernels of any back end, which stores all
+Jacobians, and `NativeLinearizer` in C, which stores none. Cameras are rows (n, c) of a model's
+storage, points rows (m, b); steps are in own tangents, d numbers a camera and b a point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.cameras import CameraModel
+from epigauge.two_view.losses import Loss
+
+__all__ = [
+    "LEAST_WEIGHT",
+    "Coupling",
+    "Factor",
+    "Linearizer",
+    "Normal",
+    "Pairs",
+    "PointRefinement",
+    "point_damping",
+]
+
+Array = NDArray[np.float64]
+
+#: Least weight in the normal equations, of the largest: what only observations without weight (or
+#: beyond a truncated loss) determine stays determined, and does not influence the rest.
+LEAST_WEIGHT = 1e-8
+
+
+@dataclass(frozen=True)
+class PointRefinement:
+    """How a point is moved, all cameras kept: damped Gauss-Newton of its own.
+
+    Attributes
+    ----------
+    iterations : int
+        Most steps tried.
+    lam, factor : float
+        First lambda, and what it is divided or multiplied by.
+    tolerance : float
+        A point is done where a step promises to lower its cost by less than this share.
+    """
+
+    iterations: int = 5
+    lam: float = 1e-3
+    factor: float = 10.0
+    tolerance: float = 1e-12
+
+
+class Factor(Protocol):
+    """A factor of the reduced system of the cameras."""
+
+    def solve(self, right: Array) -> Array:
+        """Return the solution for right-hand sides (n, a, k)."""
+
+
+class Pairs(Protocol):
+    """P = W T T^T W^T, what the points take off the cameras' blocks."""
+
+    def factor(self, U: Array, A: Array | None) -> Factor:
+        """Return a factor of U - A^T P A, blocks U (n, a, a) and A (n, d, a).
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If it is not positive definite.
+        """
+
+    def times(self, x: Array) -> Array:
+        """Return P x for x (n, d, k)."""
+
+    def dense(self) -> Array:
+        """Return P, (n, d, n, d)."""
+
+
+class Coupling(Protocol):
+    """The blocks W of J^T J that couple cameras (d) and points (b)."""
+
+    @property
+    def direct(self) -> bool:
+        """Tell whether the reduced system is to be stored and factored, or only iterated with."""
+
+    def to_points(self, T: Array | None, x: Array) -> Array:
+        """Return T^T W^T x, (m, b), for x (n, d) and T (m, b, b), or one."""
+
+    def to_cameras(self, T: Array | None, y: Array) -> Array:
+        """Return W T y, (n, d), for y (m, b) and T (m, b, b), or one."""
+
+    def schur(self, T: Array, half: Array | None) -> tuple[Pairs, Array]:
+        """Return P = W T T^T W^T, and W T half (n, d); half None is zero."""
+
+    def diagonal(self, T: Array) -> Array:
+        """Return the diagonal blocks of P, (n, d, d)."""
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations in own tangents.
+
+    Attributes
+    ----------
+    U, V : ndarray, shape (n, d, d), (m, b, b)
+        Blocks of J^T J.
+    g_cameras, g_points : ndarray, shape (n, d), (m, b)
+        Gradient of the cost.
+    coupling : Coupling
+        The blocks that couple both.
+    depth_blocks : tuple of ndarray, or None
+        For homogeneous points the blocks of Z^T Z, Z = d log depth weighted as the residuals.
+    """
+
+    U: Array
+    V: Array
+    g_cameras: Array
+    g_points: Array
+    coupling: Coupling
+    depth_blocks: tuple[Array, Array] | None = None
+
+
+class Linearizer(Protocol):
+    """Evaluates cameras (n, c) and points (m, b)."""
+
+    @property
+    def graph(self) -> ObservationGraph:
+        """Return which observation belongs to what."""
+
+    @property
+    def loss(self) -> Loss:
+        """Return the loss of each squared residual."""
+
+    def with_loss(self, loss: Loss) -> Linearizer:
+        """Return the same observations with another loss."""
+
+    def residuals(self, cameras: Array, points: Array) -> Array:
+        """Return r = q - q_hat, (2, N)."""
+
+    def point_costs(self, cameras: Array, points: Array) -> Array:
+        """Return the weighted robust sum of each point, (m,); not finite in a focal plane."""
+
+    def linearize(self, cameras: Array, points: Array) -> Normal:
+        """Return the normal equations."""
+
+    def refine_points(
+        self, cameras: Array, points: Array, how: PointRefinement
+    ) -> tuple[Array, Array]:
+        """Return the points moved to where their own observations want them, and their costs."""
+
+    def inverse_roots(self, V: Array, D: Array, lam: float, g: Array) -> tuple[Array, Array]:
+        """Return T with T T^T = (V + lam D)^-1 for blocks (m, b, b), and T^T g.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If a block is not positive definite.
+        """
+
+
+def point_damping(model: CameraModel, V: Array, depth: Array | None) -> Array:
+    """Return the damping blocks of points that a change of gauge leaves as they are, (m, b, b).
+
+    The Gauss-Newton block V alone would damp nothing along the line of sight of a point with
+    little parallax: homogeneous points add Z^T Z, and similarities leave tr(V) I as it is. Affine
+    cameras have parallel lines of sight, along which nothing can go wrong.
+
+    Parameters
+    ----------
+    model : CameraModel
+        The camera, whose gauge group decides.
+    V : ndarray, shape (m, b, b)
+        Point blocks of J^T J.
+    depth : ndarray, shape (m, b, b), or None
+        Those of Z^T Z, for homogeneous points.
+    """
+    if model.homogeneous:
+        assert depth is not None
+        return V + depth
+    if not model.metric:
+        return V
+    trace = np.einsum("mii->m", V) / V.shape[1]
+    return np.asarray(trace[:, None, None] * np.eye(V.shape[1]))

@@ -1,0 +1,78 @@
+"""Which observation belongs to which camera and point: the visibility graph."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["ObservationGraph"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class ObservationGraph:
+    """Which observation belongs to which camera and point; sorted by point, then view.
+
+    A point may be observed more than once in a view.
+
+    Attributes
+    ----------
+    view, point : ndarray of int, shape (N,)
+        Indices.
+    n_views, n_points : int
+        Numbers of cameras and points; every index is used.
+    """
+
+    view: Indices
+    point: Indices
+    n_views: int
+    n_points: int
+
+    @cached_property
+    def first(self) -> Indices:
+        """Return the first observation of each point, and N."""
+        return np.searchsorted(self.point, np.arange(self.n_points + 1))
+
+    @cached_property
+    def by_view(self) -> Indices:
+        """Return the observations sorted by view."""
+        return np.argsort(self.view, kind="stable")
+
+    @cached_property
+    def first_in_view(self) -> Indices:
+        """Return where each view starts in `by_view`, and N."""
+        return np.searchsorted(self.view[self.by_view], np.arange(self.n_views + 1))
+
+    @cached_property
+    def simple(self) -> ObservationGraph:
+        """Return the graph without repetitions: one edge a pair of view and point."""
+        if self.first_of_edge is None:
+            return self
+        rows = self.first_of_edge
+        return ObservationGraph(self.view[rows], self.point[rows], self.n_views, self.n_points)
+
+    @cached_property
+    def first_of_edge(self) -> Indices | None:
+        """Return the first observation of each edge; None where each observation is one."""
+        new = np.ones(len(self.view), np.bool_)
+        new[1:] = (np.diff(self.view) != 0) | (np.diff(self.point) != 0)
+        return None if new.all() else np.flatnonzero(new)
+
+    def sum_points(self, values: Array) -> Array:
+        """Add up values (N, ...) over the observations of each point."""
+        return np.add.reduceat(values, self.first[:-1], axis=0)
+
+    def sum_views(self, values: Array) -> Array:
+        """Add up values (N, ...) over the observations of each view."""
+        return np.add.reduceat(values[self.by_view], self.first_in_view[:-1], axis=0)
+
+    def sum_edges(self, values: Array) -> Array:
+        """Add up values (N, ...) over the observations of each edge of `simple`."""
+        if self.first_of_edge is None:
+            return values
+        return np.add.reduceat(values, self.first_of_edge, axis=0)

@@ -1,0 +1,268 @@
+"""Gaussian priors on positions, intrinsics and points: what is known beside the images.
+
+Each adds 0.5 e^T covariance^-1 e to the cost, e the deviation from what is known. Observations
+count as if measured with one pixel (and weight one): give `sigma` divided by the noise of the
+image, in pixels, where that is not one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge._arguments import as_real
+from epigauge.bundle.linearizer import Normal
+from epigauge.bundle.similarity import Similarity
+from epigauge.cameras import MetricReconstruction, camera_model
+from epigauge.errors import ArgumentError
+
+__all__ = ["IntrinsicPrior", "PointPrior", "PositionPrior", "Prior", "Priors"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: Least ratio of the axes of a covariance.
+_CONDITION = 1e-12
+
+
+@dataclass(frozen=True)
+class PositionPrior:
+    """The centre of a view is known, as from a satellite receiver.
+
+    Parameters
+    ----------
+    view : int
+        Which.
+    position : array_like, shape (3,)
+        Where, in the frame of the start.
+    sigma : float or array_like, shape (3,), optional
+        Standard deviations of the three coordinates.
+    covariance : array_like, shape (3, 3), optional
+        In place of `sigma`.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.PositionPrior(0, (10.0, 20.0, 1.5), sigma=(0.02, 0.02, 0.05)).view
+    0
+    """
+
+    view: int
+    position: ArrayLike
+    sigma: ArrayLike | None = None
+    covariance: ArrayLike | None = None
+
+
+@dataclass(frozen=True)
+class IntrinsicPrior:
+    """A parameter of a camera is known, as a focal length from a data sheet.
+
+    Parameters
+    ----------
+    camera : int
+        Row of `Cameras.params`.
+    name : str
+        Name of the parameter, as ``"f"``.
+    value, sigma : float
+        Value and standard deviation, in the parameter's unit.
+    """
+
+    camera: int
+    name: str
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class PointPrior:
+    """A point is known, as a control point.
+
+    Parameters
+    ----------
+    point : int
+        Which.
+    position : array_like, shape (3,)
+        Where, in the frame of the start.
+    sigma : float or array_like, shape (3,), optional
+        Standard deviations of the three coordinates.
+    covariance : array_like, shape (3, 3), optional
+        In place of `sigma`.
+    """
+
+    point: int
+    position: ArrayLike
+    sigma: ArrayLike | None = None
+    covariance: ArrayLike | None = None
+
+
+Prior = PositionPrior | IntrinsicPrior | PointPrior
+
+
+@dataclass(frozen=True)
+class Priors:
+    """Priors as arrays.
+
+    Attributes
+    ----------
+    views, positions, view_information : ndarray, shape (k,), (k, 3), (k, 3, 3)
+        Known centres with their inverse covariance.
+    points, places, point_information : ndarray, shape (l,), (l, 3), (l, 3, 3)
+        Known points.
+    cameras : ndarray of int, shape (j,)
+        The first view of each camera with a known parameter: shared by all its views, a prior
+        counts once.
+    params, values, precisions : ndarray, shape (j,)
+        Which parameter, its value and inverse variance.
+    """
+
+    views: Indices
+    positions: Array
+    view_information: Array
+    points: Indices
+    places: Array
+    point_information: Array
+    cameras: Indices
+    params: Indices
+    values: Array
+    precisions: Array
+
+    @staticmethod
+    def of(priors: Sequence[Prior], start: MetricReconstruction) -> Priors:
+        """Check priors against the reconstruction that they are on.
+
+        Raises
+        ------
+        ArgumentError
+            On anything but priors, and on priors on what does not exist; the message has their
+            number.
+        """
+        names = camera_model(start.cameras.model).params
+        places: dict[type, list[tuple[int, Array, Array]]] = {PositionPrior: [], PointPrior: []}
+        intrinsics: list[tuple[int, int, float, float]] = []
+        for number, prior in enumerate(priors):
+            what = f"priors[{number}]"
+            if isinstance(prior, PositionPrior):
+                view = _index(f"{what}.view", prior.view, start.n_views)
+                places[PositionPrior].append((view, *_gaussian(what, prior)))
+            elif isinstance(prior, PointPrior):
+                point = _index(f"{what}.point", prior.point, start.n_points)
+                places[PointPrior].append((point, *_gaussian(what, prior)))
+            elif isinstance(prior, IntrinsicPrior):
+                camera = _index(f"{what}.camera", prior.camera, len(start.cameras))
+                if prior.name not in names:
+                    known = f"one of {', '.join(names)}" if names else "none: it has no parameters"
+                    raise ArgumentError(f"{what}.name", f"is {prior.name!r:.60}", known)
+                value = _number(f"{what}.value", prior.value)
+                sigma = _number(f"{what}.sigma", prior.sigma)
+                if not sigma > 0.0:
+                    raise ArgumentError(f"{what}.sigma", f"is {sigma}", "a positive number")
+                first = int(np.argmax(start.cameras.camera_of_view == camera))
+                intrinsics.append((first, names.index(prior.name), value, sigma**-2))
+            else:
+                kinds = "eg.PositionPrior, eg.IntrinsicPrior or eg.PointPrior"
+                raise ArgumentError(what, f"is a {type(prior).__name__}", kinds)
+        j = np.array([row[:2] for row in intrinsics], np.intp).reshape(-1, 2)
+        v = np.array([row[2:] for row in intrinsics]).reshape(-1, 2)
+        stacked = _stacked(places[PositionPrior]), _stacked(places[PointPrior])
+        return Priors(*stacked[0], *stacked[1], j[:, 0], j[:, 1], v[:, 0], v[:, 1])
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self.views) + len(self.points) + len(self.cameras)
+
+    def moved(self, there: Similarity) -> Priors:
+        """Return the same in another frame, moved as the reconstruction is."""
+        return replace(
+            self,
+            positions=there.positions(self.positions),
+            places=there.positions(self.places),
+            view_information=there.information(self.view_information),
+            point_information=there.information(self.point_information),
+        )
+
+    def cost(self, cameras: Array, points: Array) -> float:
+        """Return what they add to the cost."""
+        c, x, k = self._deviations(cameras, points)
+        total = np.einsum("ki,kij,kj->", c, self.view_information, c)
+        total = total + np.einsum("ki,kij,kj->", x, self.point_information, x)
+        return 0.5 * float(total + np.sum(self.precisions * k**2))
+
+    def added(self, normal: Normal, cameras: Array, points: Array) -> Normal:
+        """Return normal equations with theirs."""
+        if not len(self):
+            return normal
+        U, V = normal.U.copy(), normal.V.copy()
+        g_cameras, g_points = normal.g_cameras.copy(), normal.g_points.copy()
+        c, x, k = self._deviations(cameras, points)
+        # The centre moves by R^T times the camera's move, the tangent's entries 3 to 5.
+        R = cameras[self.views, :12].reshape(-1, 3, 4)[:, :, :3]
+        moved = R @ self.view_information
+        np.add.at(U[:, 3:6, 3:6], self.views, moved @ np.swapaxes(R, 1, 2))
+        np.add.at(g_cameras[:, 3:6], self.views, np.einsum("kij,kj->ki", moved, c))
+        np.add.at(U, (self.cameras, 6 + self.params, 6 + self.params), self.precisions)
+        np.add.at(g_cameras, (self.cameras, 6 + self.params), self.precisions * k)
+        np.add.at(V, self.points, self.point_information)
+        np.add.at(g_points, self.points, np.einsum("kij,kj->ki", self.point_information, x))
+        return replace(normal, U=U, V=V, g_cameras=g_cameras, g_points=g_points)
+
+    def _deviations(self, cameras: Array, points: Array) -> tuple[Array, Array, Array]:
+        pose = cameras[self.views, :12].reshape(-1, 3, 4)
+        centres = -np.einsum("kji,kj->ki", pose[:, :, :3], pose[:, :, 3])
+        known = cameras[self.cameras, 12 + self.params]
+        return centres - self.positions, points[self.points] - self.places, known - self.values
+
+
+def _stacked(rows: list[tuple[int, Array, Array]]) -> tuple[Indices, Array, Array]:
+    return (
+        np.array([row[0] for row in rows], np.intp),
+        np.array([row[1] for row in rows]).reshape(-1, 3),
+        np.array([row[2] for row in rows]).reshape(-1, 3, 3),
+    )
+
+
+def _index(name: str, value: Any, count: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise ArgumentError(name, f"is {value!r:.60}", "an integer")
+    if not 0 <= value < count:
+        raise ArgumentError(name, f"is {value}", f"0 to {count - 1}")
+    return int(value)
+
+
+def _number(name: str, value: Any) -> float:
+    array = as_real(name, value, "a number")
+    if array.ndim or not np.isfinite(array):
+        raise ArgumentError(name, f"is {value!r:.60}", "a finite number")
+    return float(array)
+
+
+def _gaussian(what: str, prior: PositionPrior | PointPrior) -> tuple[Array, Array]:
+    """Return position (3,) and inverse covariance (3, 3)."""
+    position = as_real(f"{what}.position", prior.position, "three numbers")
+    if position.shape != (3,) or not np.isfinite(position).all():
+        raise ArgumentError(
+            f"{what}.position", f"is {prior.position!r:.60}", "three finite numbers"
+        )
+    if (prior.sigma is None) == (prior.covariance is None):
+        given = "neither" if prior.sigma is None else "both"
+        raise ArgumentError(what, f"has {given} of sigma and covariance", "one of them")
+    if prior.sigma is not None:
+        sigma = as_real(f"{what}.sigma", prior.sigma, "one or three numbers")
+        if sigma.shape not in ((), (3,)) or not (np.isfinite(sigma) & (sigma > 0.0)).all():
+            raise ArgumentError(
+                f"{what}.sigma", f"is {prior.sigma!r:.60}", "positive, one or three"
+            )
+        return position, np.diag(np.broadcast_to(sigma, 3) ** -2.0)
+    name = f"{what}.covariance"
+    assert prior.covariance is not None
+    covariance = as_real(name, prior.covariance, "a (3, 3) matrix")
+    if covariance.shape != (3, 3) or not np.isfinite(covariance).all():
+        raise ArgumentError(name, f"has shape {covariance.shape}", "a finite (3, 3) matrix")
+    size = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    unit = covariance / np.outer(size, size) if (size > 0.0).all() else np.zeros((3, 3))
+    if np.linalg.eigvalsh(unit)[0] <= _CONDITION or not np.allclose(unit, unit.T, atol=1e-9):
+        raise ArgumentError(name, "is not symmetric and positive definite", "a covariance")
+    return position, np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)))

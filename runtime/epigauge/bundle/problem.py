@@ -1,0 +1,137 @@
+"""The bundle adjustment problem for cameras of any model: what `epigauge.lm` minimises."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.bundle.freedom import Freedom
+from epigauge.bundle.linearizer import Linearizer, PointRefinement
+from epigauge.bundle.priors import Priors
+from epigauge.bundle.solve import Step, System
+from epigauge.cameras import MAX_FOCAL, MIN_FOCAL, CameraModel
+
+__all__ = ["BundleProblem", "BundleState", "Estimate"]
+
+Array = NDArray[np.float64]
+Retraction = Callable[[Array, Array], Array]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Cameras (n, c) and points (m, b).
+
+    Attributes
+    ----------
+    steps : int
+        How many steps led here.
+    point_costs : ndarray, shape (m,), or None
+        The points' share of the cost, where it is known already.
+    """
+
+    cameras: Array
+    points: Array
+    steps: int = 0
+    point_costs: Array | None = None
+
+
+@dataclass(frozen=True)
+class BundleState:
+    """An estimate and its cost, 0.5 times the weighted robust sum and the priors'."""
+
+    estimate: Estimate
+    cost: float
+
+    @property
+    def cameras(self) -> Array:
+        """Return the cameras, (n, c)."""
+        return self.estimate.cameras
+
+    @property
+    def points(self) -> Array:
+        """Return the points, (m, b)."""
+        return self.estimate.points
+
+
+@dataclass(frozen=True)
+class BundleProblem:
+    """Robust weighted sum of squared residuals as a function of cameras and points.
+
+    Attributes
+    ----------
+    model : CameraModel
+        The camera.
+    linearizer : Linearizer
+        The observations, and what evaluates them.
+    retraction : callable
+        Moves cameras (n, c) by own tangents (n, d).
+    freedom : Freedom
+        What is free, and the gauge that estimates are kept in.
+    priors : Priors or None
+        What is known beside the images.
+    refinement : PointRefinement or None
+        After each step re-triangulate every point (variable projection), and how.
+    floor : float
+        A cost this low is rounding error.
+    """
+
+    model: CameraModel
+    linearizer: Linearizer
+    retraction: Retraction
+    freedom: Freedom = field(default_factory=Freedom)
+    priors: Priors | None = None
+    refinement: PointRefinement | None = None
+    floor: float = 0.0
+
+    def evaluate(self, estimate: Estimate) -> BundleState:
+        """Return the state of an estimate; a cost of infinity where it has none."""
+        costs = estimate.point_costs
+        if costs is None:
+            costs = self.linearizer.point_costs(estimate.cameras, estimate.points)
+        with np.errstate(over="ignore"):
+            cost = 0.5 * float(costs.sum())
+        if self.priors is not None:
+            cost += self.priors.cost(estimate.cameras, estimate.points)
+        # A point may fall onto a focal plane, a focal length to nothing: such trials are rejected.
+        usable = math.isfinite(cost) and self._focal(estimate.cameras)
+        return BundleState(estimate, cost if usable else float("inf"))
+
+    def linearize(self, state: BundleState) -> System:
+        """Return the normal equations."""
+        cameras, points = state.cameras, state.points
+        normal = self.linearizer.linearize(cameras, points)
+        if self.priors is not None:
+            normal = self.priors.added(normal, cameras, points)
+        normal, border = self.freedom.constrained(normal, cameras, points)
+        ties = self.freedom.ties_at(cameras, points)
+        return System(self.model, self.linearizer, cameras, points, normal, ties, border)
+
+    def retract(self, state: BundleState, step: Step) -> Estimate:
+        """Return the estimate that a step leads to, its points re-triangulated where asked for."""
+        cameras = self.retraction(state.cameras, step.cameras)
+        cameras = self.freedom.retracted(state.cameras, cameras, step.cameras)
+        points, steps = state.points + step.points, state.estimate.steps + 1
+        cameras, points = self.freedom.settled(cameras, points, steps)
+        if self.refinement is None:
+            return Estimate(cameras, points, steps)
+        refined, costs = self.refined(cameras, points)
+        return Estimate(cameras, refined, steps, costs)
+
+    def refined(self, cameras: Array, points: Array) -> tuple[Array, Array]:
+        """Return points after iterations of their own, and their costs."""
+        assert self.refinement is not None
+        refined, costs = self.linearizer.refine_points(cameras, points, self.refinement)
+        kept = self.freedom.kept
+        if kept is None:
+            return refined, costs
+        refined = np.where(kept[:, None], points, refined)
+        return refined, self.linearizer.point_costs(cameras, refined)
+
+    def _focal(self, cameras: Array) -> bool:
+        places = list(self.model.focal)
+        focal = cameras[:, 12:][:, places]
+        return bool(np.all((focal >= MIN_FOCAL) & (focal <= MAX_FOCAL)))

@@ -1,0 +1,82 @@
+"""Similarities of space: the gauge freedom of cameras with known or modelled intrinsics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Similarity", "normal_frame"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """X -> scale rotation (X - origin) + target.
+
+    Origin and target are kept apart: a scene far from its origin is first moved there, without
+    rounding.
+
+    Attributes
+    ----------
+    scale : float
+        Positive.
+    rotation : ndarray, shape (3, 3)
+        A rotation.
+    origin, target : ndarray, shape (3,)
+        The point that moves, and where it moves to.
+    """
+
+    scale: float
+    rotation: Array
+    origin: Array
+    target: Array
+
+    def inverse(self) -> Similarity:
+        """Return the similarity that undoes this one."""
+        return Similarity(1.0 / self.scale, self.rotation.T, self.target, self.origin)
+
+    def positions(self, X: Array) -> Array:
+        """Return moved positions (m, 3)."""
+        return np.asarray(self.scale * (X - self.origin) @ self.rotation.T + self.target)
+
+    def information(self, blocks: Array) -> Array:
+        """Return moved inverse covariances of positions, (k, 3, 3)."""
+        return np.asarray(self.rotation @ blocks @ self.rotation.T / self.scale**2)
+
+    def apply(self, cameras: Array, points: Array) -> tuple[Array, Array]:
+        """Return moved cameras (n, c), rows (R | t) and intrinsics, and points (m, 3).
+
+        No image changes: R <- R rotation^T, and the centres move as the points do.
+        """
+        pose = cameras[:, :12].reshape(-1, 3, 4)
+        R = pose[:, :, :3] @ self.rotation.T
+        # t <- scale (t + R origin) - R' target.
+        t = self.scale * (pose[:, :, 3] + pose[:, :, :3] @ self.origin) - R @ self.target
+        moved = cameras.copy()
+        moved[:, :12] = np.concatenate([R, t[:, :, None]], axis=2).reshape(-1, 12)
+        return moved, self.positions(points)
+
+    def blocks(self, n: int, m: int, d: int) -> tuple[Array, Array]:
+        """Return what own tangents of cameras (n, d, d) and points (m, 3, 3) are multiplied by."""
+        scales = np.ones(d)
+        scales[3:6] = self.scale
+        return (
+            np.broadcast_to(np.diag(scales), (n, d, d)),
+            np.broadcast_to(self.scale * self.rotation, (m, 3, 3)),
+        )
+
+
+def normal_frame(cameras: Array, points: Array) -> Similarity:
+    """Return the move to where computing suits best: the cameras about the origin, of size one.
+
+    The median distance of the points from the mean centre becomes one; directions stay.
+    """
+    pose = cameras[:, :12].reshape(-1, 3, 4)
+    # Differences of positions are what counts: nothing is added up far from the origin.
+    centres = -np.einsum("nji,nj->ni", pose[:, :, :3], pose[:, :, 3])
+    centre = centres[0] + np.mean(centres - centres[0], axis=0)
+    size = float(np.median(np.linalg.norm(points - centre, axis=1)))
+    return Similarity(1.0 / size if size > 0.0 else 1.0, np.eye(3), centre, np.zeros(3))
