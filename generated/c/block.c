@@ -4,6 +4,53 @@
 #include <math.h>
 #include <string.h>
 
+/* Formula: F = U12 M V12^T.
+   Inputs:  U (3, 3), V (3, 3), M (2, 2)
+   Outputs: F (3, 3)
+   Operations: 45, temporaries: 6. */
+EG_EXPORT void eg_block_fundamental(
+    ptrdiff_t n,
+    const double *EG_RESTRICT U,
+    const double *EG_RESTRICT V,
+    const double *EG_RESTRICT M,
+    double *EG_RESTRICT F)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double U00 = U[i];
+        const double U01 = U[n + i];
+        const double U10 = U[3*n + i];
+        const double U11 = U[4*n + i];
+        const double U20 = U[6*n + i];
+        const double U21 = U[7*n + i];
+        const double V00 = V[i];
+        const double V01 = V[n + i];
+        const double V10 = V[3*n + i];
+        const double V11 = V[4*n + i];
+        const double V20 = V[6*n + i];
+        const double V21 = V[7*n + i];
+        const double M00 = M[i];
+        const double M01 = M[n + i];
+        const double M10 = M[2*n + i];
+        const double M11 = M[3*n + i];
+        const double t0 = M00*U00 + M10*U01;
+        const double t1 = M01*U00 + M11*U01;
+        const double t2 = M00*U10 + M10*U11;
+        const double t3 = M01*U10 + M11*U11;
+        const double t4 = M00*U20 + M10*U21;
+        const double t5 = M01*U20 + M11*U21;
+        F[i] = V00*t0 + V01*t1;
+        F[n + i] = V10*t0 + V11*t1;
+        F[2*n + i] = V20*t0 + V21*t1;
+        F[3*n + i] = V00*t2 + V01*t3;
+        F[4*n + i] = V10*t2 + V11*t3;
+        F[5*n + i] = V20*t2 + V21*t3;
+        F[6*n + i] = V00*t4 + V01*t5;
+        F[7*n + i] = V10*t4 + V11*t5;
+        F[8*n + i] = V20*t4 + V21*t5;
+    }
+}
+
 /* Formula: F = U12 M V12^T with first and second derivatives of vect(F) by the seven update
    parameters (x1, x2, y1, y2, and three of M), at no update.
    Inputs:  U (3, 3), V (3, 3), M (2, 2)

@@ -44,6 +44,230 @@ EG_EXPORT void eg_algebraic(
     }
 }
 
+/* Formula: A^T A (upper triangle) of the equations A vect(F) = 0 of the 8-point algorithm, a
+   row of A being d(q'^T F q) / d vect(F).
+   Inputs:  q1 (2,), q2 (2,), weight ()
+   Outputs: N (45,) summed
+   Operations: 39, temporaries: 20. */
+EG_EXPORT void eg_algebraic_normal(
+    ptrdiff_t n,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT N)
+{
+    double sum_N0 = 0.0;
+    double sum_N1 = 0.0;
+    double sum_N2 = 0.0;
+    double sum_N3 = 0.0;
+    double sum_N4 = 0.0;
+    double sum_N5 = 0.0;
+    double sum_N6 = 0.0;
+    double sum_N7 = 0.0;
+    double sum_N8 = 0.0;
+    double sum_N9 = 0.0;
+    double sum_N10 = 0.0;
+    double sum_N12 = 0.0;
+    double sum_N13 = 0.0;
+    double sum_N15 = 0.0;
+    double sum_N16 = 0.0;
+    double sum_N17 = 0.0;
+    double sum_N20 = 0.0;
+    double sum_N23 = 0.0;
+    double sum_N24 = 0.0;
+    double sum_N25 = 0.0;
+    double sum_N26 = 0.0;
+    double sum_N27 = 0.0;
+    double sum_N28 = 0.0;
+    double sum_N29 = 0.0;
+    double sum_N30 = 0.0;
+    double sum_N31 = 0.0;
+    double sum_N33 = 0.0;
+    double sum_N34 = 0.0;
+    double sum_N35 = 0.0;
+    double sum_N38 = 0.0;
+    double sum_N39 = 0.0;
+    double sum_N40 = 0.0;
+    double sum_N41 = 0.0;
+    double sum_N42 = 0.0;
+    double sum_N43 = 0.0;
+    double sum_N44 = 0.0;
+#ifndef _MSC_VER
+#pragma omp simd reduction(+ : sum_N0, sum_N1, sum_N2, sum_N3, sum_N4, sum_N5, sum_N6, sum_N7, sum_N8, sum_N9, sum_N10, sum_N12, sum_N13, sum_N15, sum_N16, sum_N17, sum_N20, sum_N23, sum_N24, sum_N25, sum_N26, sum_N27, sum_N28, sum_N29, sum_N30, sum_N31, sum_N33, sum_N34, sum_N35, sum_N38, sum_N39, sum_N40, sum_N41, sum_N42, sum_N43, sum_N44)
+#endif
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double q1_0 = q1[i];
+        const double q1_1 = q1[n + i];
+        const double q2_0 = q2[i];
+        const double q2_1 = q2[n + i];
+        const double weight = weight_array[i];
+        const double t0 = q1_0*q1_0;
+        const double t1 = q2_0*q2_0*weight;
+        const double t2 = q1_0*t1;
+        const double t3 = q2_0*weight;
+        const double t4 = t0*t3;
+        const double t5 = q1_0*t3;
+        const double t6 = q2_1*t5;
+        const double t7 = q1_1*t6;
+        const double t8 = q1_1*t5;
+        const double t9 = q1_1*q1_1;
+        const double t10 = t3*t9;
+        const double t11 = q1_1*t3;
+        const double t12 = q2_1*t11;
+        const double t13 = q2_1*q2_1*weight;
+        const double t14 = q1_0*t13;
+        const double t15 = q2_1*weight;
+        const double t16 = q1_0*t15;
+        const double t17 = q1_1*t16;
+        const double t18 = q1_1*t15;
+        const double t19 = q1_0*weight;
+        sum_N0 += t0*t1;
+        sum_N1 += q1_1*t2;
+        sum_N2 += t2;
+        sum_N3 += q2_1*t4;
+        sum_N4 += t7;
+        sum_N5 += t6;
+        sum_N6 += t4;
+        sum_N7 += t8;
+        sum_N8 += t5;
+        sum_N9 += t1*t9;
+        sum_N10 += q1_1*t1;
+        sum_N12 += q2_1*t10;
+        sum_N13 += t12;
+        sum_N15 += t10;
+        sum_N16 += t11;
+        sum_N17 += t1;
+        sum_N20 += q2_1*t3;
+        sum_N23 += t3;
+        sum_N24 += t0*t13;
+        sum_N25 += q1_1*t14;
+        sum_N26 += t14;
+        sum_N27 += t0*t15;
+        sum_N28 += t17;
+        sum_N29 += t16;
+        sum_N30 += t13*t9;
+        sum_N31 += q1_1*t13;
+        sum_N33 += t15*t9;
+        sum_N34 += t18;
+        sum_N35 += t13;
+        sum_N38 += t15;
+        sum_N39 += t0*weight;
+        sum_N40 += q1_1*t19;
+        sum_N41 += t19;
+        sum_N42 += t9*weight;
+        sum_N43 += q1_1*weight;
+        sum_N44 += weight;
+    }
+    N[0] = sum_N0;
+    N[1] = sum_N1;
+    N[2] = sum_N2;
+    N[3] = sum_N3;
+    N[4] = sum_N4;
+    N[5] = sum_N5;
+    N[6] = sum_N6;
+    N[7] = sum_N7;
+    N[8] = sum_N8;
+    N[9] = sum_N9;
+    N[10] = sum_N10;
+    N[11] = sum_N4;
+    N[12] = sum_N12;
+    N[13] = sum_N13;
+    N[14] = sum_N7;
+    N[15] = sum_N15;
+    N[16] = sum_N16;
+    N[17] = sum_N17;
+    N[18] = sum_N5;
+    N[19] = sum_N13;
+    N[20] = sum_N20;
+    N[21] = sum_N8;
+    N[22] = sum_N16;
+    N[23] = sum_N23;
+    N[24] = sum_N24;
+    N[25] = sum_N25;
+    N[26] = sum_N26;
+    N[27] = sum_N27;
+    N[28] = sum_N28;
+    N[29] = sum_N29;
+    N[30] = sum_N30;
+    N[31] = sum_N31;
+    N[32] = sum_N28;
+    N[33] = sum_N33;
+    N[34] = sum_N34;
+    N[35] = sum_N35;
+    N[36] = sum_N29;
+    N[37] = sum_N34;
+    N[38] = sum_N38;
+    N[39] = sum_N39;
+    N[40] = sum_N40;
+    N[41] = sum_N41;
+    N[42] = sum_N42;
+    N[43] = sum_N43;
+    N[44] = sum_N44;
+}
+
+/* Formula: A^T A vect(F), from the residuals q'^T F q and not from A^T A (8-point algorithm).
+   Inputs:  F (3, 3) shared, q1 (2,), q2 (2,), weight ()
+   Outputs: g (9,) summed
+   Operations: 25, temporaries: 3. */
+EG_EXPORT void eg_algebraic_gradient(
+    ptrdiff_t n,
+    const double *EG_RESTRICT F,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT g)
+{
+    const double F00 = F[0];
+    const double F01 = F[1];
+    const double F02 = F[2];
+    const double F10 = F[3];
+    const double F11 = F[4];
+    const double F12 = F[5];
+    const double F20 = F[6];
+    const double F21 = F[7];
+    const double F22 = F[8];
+    double sum_g0 = 0.0;
+    double sum_g1 = 0.0;
+    double sum_g2 = 0.0;
+    double sum_g3 = 0.0;
+    double sum_g4 = 0.0;
+    double sum_g5 = 0.0;
+    double sum_g6 = 0.0;
+    double sum_g7 = 0.0;
+    double sum_g8 = 0.0;
+#ifndef _MSC_VER
+#pragma omp simd reduction(+ : sum_g0, sum_g1, sum_g2, sum_g3, sum_g4, sum_g5, sum_g6, sum_g7, sum_g8)
+#endif
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double q1_0 = q1[i];
+        const double q1_1 = q1[n + i];
+        const double q2_0 = q2[i];
+        const double q2_1 = q2[n + i];
+        const double weight = weight_array[i];
+        const double t0 = weight*(F22 + F02*q2_0 + F12*q2_1 + q1_0*(F20 + F00*q2_0 + F10*q2_1) + q1_1*(F21 + F01*q2_0 + F11*q2_1));
+        const double t1 = q2_0*t0;
+        const double t2 = q2_1*t0;
+        sum_g0 += q1_0*t1;
+        sum_g1 += q1_1*t1;
+        sum_g2 += t1;
+        sum_g3 += q1_0*t2;
+        sum_g4 += q1_1*t2;
+        sum_g5 += t2;
+        sum_g6 += q1_0*t0;
+        sum_g7 += q1_1*t0;
+        sum_g8 += t0;
+    }
+    g[0] = sum_g0;
+    g[1] = sum_g1;
+    g[2] = sum_g2;
+    g[3] = sum_g3;
+    g[4] = sum_g4;
+    g[5] = sum_g5;
+    g[6] = sum_g6;
+    g[7] = sum_g7;
+    g[8] = sum_g8;
+}
+
 /* Formula: signed distances in pixels of q to the line F^T q' and of q' to the line F q (B&S
    section 4, point-to-epipolar-line criterion).
    Inputs:  F (3, 3) shared, q1 (2,), q2 (2,)

@@ -23,6 +23,13 @@
 /* Digest of the sources: the same as C_DIGEST in epigauge_generated/signatures.py. */
 EG_EXPORT const char *eg_digest(void);
 
+EG_EXPORT void eg_block_fundamental(
+    ptrdiff_t n,
+    const double *EG_RESTRICT U,
+    const double *EG_RESTRICT V,
+    const double *EG_RESTRICT M,
+    double *EG_RESTRICT F);
+
 EG_EXPORT void eg_block_derivatives(
     ptrdiff_t n,
     const double *EG_RESTRICT U,
@@ -155,6 +162,15 @@ EG_EXPORT void eg_two_view_structure(
     double *EG_RESTRICT J_S,
     double *EG_RESTRICT J_P2);
 
+EG_EXPORT void eg_fundamental_of_coordinates(
+    ptrdiff_t n,
+    const double *EG_RESTRICT F,
+    const double *EG_RESTRICT a_array,
+    const double *EG_RESTRICT b_array,
+    const double *EG_RESTRICT shift1,
+    const double *EG_RESTRICT shift2,
+    double *EG_RESTRICT moved);
+
 EG_EXPORT void eg_algebraic(
     ptrdiff_t n,
     const double *EG_RESTRICT F,
@@ -162,6 +178,21 @@ EG_EXPORT void eg_algebraic(
     const double *EG_RESTRICT q2,
     double *EG_RESTRICT r,
     double *EG_RESTRICT dr_dF);
+
+EG_EXPORT void eg_algebraic_normal(
+    ptrdiff_t n,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_algebraic_gradient(
+    ptrdiff_t n,
+    const double *EG_RESTRICT F,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT g);
 
 EG_EXPORT void eg_epipolar(
     ptrdiff_t n,
@@ -227,6 +258,27 @@ EG_EXPORT void eg_error_series(
     ptrdiff_t n,
     const double *EG_RESTRICT K,
     double *EG_RESTRICT e);
+
+EG_EXPORT void eg_camera_transformation(
+    ptrdiff_t n,
+    const double *EG_RESTRICT T,
+    const double *EG_RESTRICT gamma_array,
+    double *EG_RESTRICT block);
+
+EG_EXPORT void eg_point_transformation(
+    ptrdiff_t n,
+    const double *EG_RESTRICT inverse,
+    const double *EG_RESTRICT alpha_array,
+    double *EG_RESTRICT block);
+
+EG_EXPORT void eg_implicit_damping(
+    ptrdiff_t n,
+    const double *EG_RESTRICT T,
+    const double *EG_RESTRICT inverse,
+    const double *EG_RESTRICT gamma_array,
+    const double *EG_RESTRICT alpha_array,
+    double *EG_RESTRICT camera,
+    double *EG_RESTRICT point);
 
 EG_EXPORT void eg_canonic_squared(
     ptrdiff_t n,

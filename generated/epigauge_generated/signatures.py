@@ -19,9 +19,15 @@ class Signature(NamedTuple):
     formula: str
 
 
-C_DIGEST = "1d5a7ad40a6e7951"
+C_DIGEST = "520dd58f4a47996c"
 
 SIGNATURES = {
+    "block_fundamental": Signature(
+        "block",
+        (Argument("U", (3, 3), True), Argument("V", (3, 3), True), Argument("M", (2, 2), True), ),
+        (Argument("F", (3, 3), True), ),
+        "F = U12 M V12^T.",
+    ),
     "block_derivatives": Signature(
         "block",
         (Argument("U", (3, 3), True), Argument("V", (3, 3), True), Argument("M", (2, 2), True), ),
@@ -124,11 +130,29 @@ SIGNATURES = {
         (Argument("r", (4,), True), Argument("J_S", (4, 3), True), Argument("J_P2", (2, 12), True), ),
         "residual r = q - q_hat of a point (a, b, 1, c) in P = (I | 0) and P', its Jacobian by the point, and that of the second image by vect(P') (B&S sections 4.1, 4.3, 5).",
     ),
+    "fundamental_of_coordinates": Signature(
+        "conditioning",
+        (Argument("F", (3, 3), True), Argument("a", (), True), Argument("b", (), True), Argument("shift1", (2,), True), Argument("shift2", (2,), True), ),
+        (Argument("moved", (3, 3), True), ),
+        "M'^T F M over its norm: F of points p, p' with q ~ M p = (a p + shift1) / b and q' ~ M' p' = (a p' + shift2) / b (conditioning of the 8-point algorithm, and back).",
+    ),
     "algebraic": Signature(
         "criteria",
         (Argument("F", (3, 3), False), Argument("q1", (2,), True), Argument("q2", (2,), True), ),
         (Argument("r", (1,), True), Argument("dr_dF", (1, 9), True), ),
         "r = q'^T F q (B&S section 4).",
+    ),
+    "algebraic_normal": Signature(
+        "criteria",
+        (Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("weight", (), True), ),
+        (Argument("N", (45,), False), ),
+        "A^T A (upper triangle) of the equations A vect(F) = 0 of the 8-point algorithm, a row of A being d(q'^T F q) / d vect(F).",
+    ),
+    "algebraic_gradient": Signature(
+        "criteria",
+        (Argument("F", (3, 3), False), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("weight", (), True), ),
+        (Argument("g", (9,), False), ),
+        "A^T A vect(F), from the residuals q'^T F q and not from A^T A (8-point algorithm).",
     ),
     "epipolar": Signature(
         "criteria",
@@ -171,6 +195,24 @@ SIGNATURES = {
         (Argument("K", (9,), True), ),
         (Argument("e", (9,), True), ),
         "e truncated at order n = 0..8, e = sum (-1)^(n+1) (1 + n/2) K(n) with K(n) = g^T (W^-1 N)^n W^-1 g (B03 eq. 10).",
+    ),
+    "camera_transformation": Signature(
+        "gauge_transformations",
+        (Argument("T", (4, 4), True), Argument("gamma", (), True), ),
+        (Argument("block", (12, 12), True), ),
+        "block of T~ that acts on vect(P), P' = gamma P T (B03 eq. 5).",
+    ),
+    "point_transformation": Signature(
+        "gauge_transformations",
+        (Argument("inverse", (4, 4), True), Argument("alpha", (), True), ),
+        (Argument("block", (4, 4), True), ),
+        "block of T~ that acts on Q, Q' = alpha T^-1 Q (B03 eq. 5); `inverse` is T^-1.",
+    ),
+    "implicit_damping": Signature(
+        "gauge_transformations",
+        (Argument("T", (4, 4), True), Argument("inverse", (4, 4), True), Argument("gamma", (), True), Argument("alpha", (), True), ),
+        (Argument("camera", (12, 12), True), Argument("point", (4, 4), True), ),
+        "W' = T~^-T T~^-1 for a camera and a point, the damping that acts in the gauge T leads to as the identity in the one it comes from (B03 eqs. 8, 9; by them gamma^-2 A^-1 and alpha^-2 A, A = T^T T); `inverse` is T^-1.",
     ),
     "canonic_squared": Signature(
         "joint",

@@ -37,17 +37,10 @@ static void fundamental(const eg_options *options, const eg_chart *chart, const 
 {
     const double *U = motion, *V = motion + 9, *rest = motion + 18;
     double own[9];
-    if (options->chart == EG_ORTHO) {
+    if (options->chart == EG_ORTHO)
         eg_fundamental_from_factors(1, U, V, rest, own);
-    } else {
-        double UM[6];
-        for (int i = 0; i < 3; ++i)
-            for (int j = 0; j < 2; ++j)
-                UM[2 * i + j] = U[3 * i] * rest[j] + U[3 * i + 1] * rest[2 + j];
-        for (int i = 0; i < 3; ++i)
-            for (int j = 0; j < 3; ++j)
-                own[3 * i + j] = UM[2 * i] * V[3 * j] + UM[2 * i + 1] * V[3 * j + 1];
-    }
+    else
+        eg_block_fundamental(1, U, V, rest, own);
     if (chart->entries)
         eg_product(9, 9, 1, chart->entries, own, F);
     else

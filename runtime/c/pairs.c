@@ -69,77 +69,69 @@ static int centre(ptrdiff_t m, const double *x, const double *weights, double *o
            determinant > SPREAD * trace * trace && sqrt(*square) > EXTENT * size;
 }
 
-/* X <- M2^T X M1 with M = [[a, 0, x], [0, a, y], [0, 0, b]] for both images; unit norm. */
-static void mapped(const double *X, double a, double b, const double *t1, const double *t2,
-                   double *result)
-{
-    double half[9], norm = 0.0;
-    for (int i = 0; i < 3; ++i) {
-        half[3 * i] = a * X[3 * i];
-        half[3 * i + 1] = a * X[3 * i + 1];
-        half[3 * i + 2] = t1[0] * X[3 * i] + t1[1] * X[3 * i + 1] + b * X[3 * i + 2];
-    }
-    for (int j = 0; j < 3; ++j) {
-        result[j] = a * half[j];
-        result[3 + j] = a * half[3 + j];
-        result[6 + j] = t2[0] * half[j] + t2[1] * half[3 + j] + b * half[6 + j];
-    }
-    for (int k = 0; k < 9; ++k)
-        norm += result[k] * result[k];
-    norm = 1.0 / sqrt(norm);
-    for (int k = 0; k < 9; ++k)
-        result[k] *= norm;
-}
-
 static void from_pixels(const conditioning_t *c, const double *F, double *conditioned)
 {
-    mapped(F, c->scale, 1.0, c->o1, c->o2, conditioned);
+    const double one = 1.0;
+    eg_fundamental_of_coordinates(1, F, &c->scale, &one, c->o1, c->o2, conditioned);
 }
 
 static void to_pixels(const double *o1, const double *o2, double scale, const double *F,
                       double *pixels)
 {
-    const double t1[2] = {-o1[0], -o1[1]}, t2[2] = {-o2[0], -o2[1]};
-    mapped(F, 1.0, scale, t1, t2, pixels);
+    const double one = 1.0, shift1[2] = {-o1[0], -o1[1]}, shift2[2] = {-o2[0], -o2[1]};
+    eg_fundamental_of_coordinates(1, F, &one, &scale, shift1, shift2, pixels);
 }
 
-/* The normalised 8-point estimate in pixels (initial.py), from the moments of the matches. */
-static void eight_point(ptrdiff_t m, const double *x1, const double *x2, const double *weights,
-                        const double *o1, const double *o2, double s1, double s2, double *F)
+/* The matches in coordinates of their own origin and scale for each image. */
+static void fill(eg_matches *matches, const double *o1, const double *o2, double s1, double s2,
+                 const double *x1, const double *x2, const double *weights)
 {
-    double moments[36] = {0.0}, A[81], values[9], vectors[81], U[9], V[9], sigma, f[9];
-    for (ptrdiff_t i = 0; i < m; ++i) {
-        if (!counts(weights, i))
-            continue;
-        const double a = (x1[2 * i] - o1[0]) / s1, b = (x1[2 * i + 1] - o1[1]) / s1;
-        const double c = (x2[2 * i] - o2[0]) / s2, d = (x2[2 * i + 1] - o2[1]) / s2;
-        const double first[6] = {a * a, a * b, a, b * b, b, 1.0};
-        const double second[6] = {c * c, c * d, c, d * d, d, 1.0};
-        for (int k = 0; k < 6; ++k)
-            for (int l = 0; l < 6; ++l)
-                moments[6 * k + l] += second[k] * first[l];
+    for (ptrdiff_t begin = 0; begin < matches->m; begin += EG_BLOCK) {
+        const ptrdiff_t n = eg_block_size(matches, begin);
+        double *q = eg_block_points(matches, begin);
+        for (ptrdiff_t i = 0; i < n; ++i) {
+            const double *first = x1 + 2 * (begin + i), *second = x2 + 2 * (begin + i);
+            q[i] = (first[0] - o1[0]) / s1;
+            q[n + i] = (first[1] - o1[1]) / s1;
+            q[2 * n + i] = (second[0] - o2[0]) / s2;
+            q[3 * n + i] = (second[1] - o2[1]) / s2;
+            matches->weights[begin + i] = weights ? weights[begin + i] : 1.0;
+        }
     }
-    /* Packed place of entry (i, j) of a symmetric 3x3 matrix. */
-    static const int place[9] = {0, 1, 2, 1, 3, 4, 2, 4, 5};
-    for (int i = 0; i < 9; ++i)
-        for (int j = 0; j < 9; ++j)
-            A[9 * i + j] = moments[6 * place[3 * (i / 3) + j / 3] + place[3 * (i % 3) + j % 3]];
+}
+
+/* The normalised 8-point estimate in pixels (initial.py). Weights only tell which matches count:
+   the estimate is a start value. */
+static void eight_point(eg_matches *matches, const double *x1, const double *x2,
+                        const double *weights, const double *o1, const double *o2, double s1,
+                        double s2, double *F)
+{
+    double N[45] = {0.0}, part[45], A[81], values[9], vectors[81], U[9], V[9], sigma, f[9];
+    fill(matches, o1, o2, s1, s2, x1, x2, weights);
+    for (ptrdiff_t i = 0; i < matches->m; ++i)
+        matches->weights[i] = counts(weights, i);
+    for (ptrdiff_t begin = 0; begin < matches->m; begin += EG_BLOCK) {
+        const ptrdiff_t n = eg_block_size(matches, begin);
+        const double *q = eg_block_points(matches, begin);
+        eg_algebraic_normal(n, q, q + 2 * n, matches->weights + begin, part);
+        for (int k = 0; k < 45; ++k)
+            N[k] += part[k];
+    }
+    for (int i = 0, k = 0; i < 9; ++i)
+        for (int j = i; j < 9; ++j, ++k)
+            A[9 * i + j] = A[9 * j + i] = N[k];
     eg_eigen(9, A, values, vectors);
     for (int k = 0; k < 9; ++k)
         f[k] = vectors[9 * k];
-    /* The moments square the condition; the gradient at f from the matches themselves restores the
+    /* A^T A squares the condition; its product with f from the matches themselves restores the
        digits that this costs (corrected seminormal equations). */
     double gradient[9] = {0.0};
-    for (ptrdiff_t i = 0; i < m; ++i) {
-        if (!counts(weights, i))
-            continue;
-        const double n1[3] = {(x1[2 * i] - o1[0]) / s1, (x1[2 * i + 1] - o1[1]) / s1, 1.0};
-        const double n2[3] = {(x2[2 * i] - o2[0]) / s2, (x2[2 * i + 1] - o2[1]) / s2, 1.0};
-        double r = 0.0;
+    for (ptrdiff_t begin = 0; begin < matches->m; begin += EG_BLOCK) {
+        const ptrdiff_t n = eg_block_size(matches, begin);
+        const double *q = eg_block_points(matches, begin);
+        eg_algebraic_gradient(n, f, q, q + 2 * n, matches->weights + begin, part);
         for (int k = 0; k < 9; ++k)
-            r += n2[k / 3] * n1[k % 3] * f[k];
-        for (int k = 0; k < 9; ++k)
-            gradient[k] += r * n2[k / 3] * n1[k % 3];
+            gradient[k] += part[k];
     }
     for (int l = 1; l < 9; ++l) {
         double along = 0.0;
@@ -191,23 +183,6 @@ static void displace(conditioning_t *c, const double *F, double offset)
     c->o2[1] -= c->scale * offset * y;
 }
 
-static void fill(eg_matches *matches, const conditioning_t *c, const double *x1, const double *x2,
-                 const double *weights)
-{
-    for (ptrdiff_t begin = 0; begin < matches->m; begin += EG_BLOCK) {
-        const ptrdiff_t n = eg_block_size(matches, begin);
-        double *q = eg_block_points(matches, begin);
-        for (ptrdiff_t i = 0; i < n; ++i) {
-            const double *first = x1 + 2 * (begin + i), *second = x2 + 2 * (begin + i);
-            q[i] = (first[0] - c->o1[0]) / c->scale;
-            q[n + i] = (first[1] - c->o1[1]) / c->scale;
-            q[2 * n + i] = (second[0] - c->o2[0]) / c->scale;
-            q[3 * n + i] = (second[1] - c->o2[1]) / c->scale;
-            matches->weights[begin + i] = weights ? weights[begin + i] : 1.0;
-        }
-    }
-}
-
 /* Returns 0 where the pair is left alone. */
 static int refine(eg_matches *matches, const double *x1, const double *x2, const double *weights,
                   const double *F0, const eg_options *options, double *result, int *numbers,
@@ -229,7 +204,7 @@ static int refine(eg_matches *matches, const double *x1, const double *x2, const
             return 0;
         memcpy(F, F0, sizeof F);
     } else {
-        eight_point(m, x1, x2, weights, c.o1, c.o2, sqrt(square1), sqrt(square2), F);
+        eight_point(matches, x1, x2, weights, c.o1, c.o2, sqrt(square1), sqrt(square2), F);
     }
     double *conditioned = result + PAIR_CONDITIONED;
     from_pixels(&c, F, conditioned);
@@ -237,7 +212,7 @@ static int refine(eg_matches *matches, const double *x1, const double *x2, const
     from_pixels(&c, F, conditioned);
     if (!eg_factorize(conditioned, motion, motion + 9, motion + 18))
         return 0;
-    fill(matches, &c, x1, x2, weights);
+    fill(matches, c.o1, c.o2, c.scale, c.scale, x1, x2, weights);
     const eg_chart chart = {7, NULL, NULL};
     eg_outcome outcome;
     eg_minimize(matches, options, &chart, motion, history, &outcome);

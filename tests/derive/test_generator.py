@@ -6,6 +6,7 @@ import importlib
 import math
 import pkgutil
 import random
+import re
 
 import numpy as np
 import pytest
@@ -333,3 +334,33 @@ def test_outputs_keep_the_shape_of_their_value():
     assert Output.of("a", [[X, Y, 0]]).shape == (1, 3)
     assert Output.of("a", [[[X], [Y]]]).entries == (X, Y)
     assert Output.of("a", list(matrix), shape=(2, 2)).entries == (X, Y, Y, X)
+
+
+def subscripts(text):
+    """Return (name, digits) of both sides of every equation of a LaTeX file."""
+    found = []
+    for line in text.splitlines():
+        if match := re.fullmatch(r"\\mathtt\{(\w+)\}_\{(.*?)\} &= (?:\w+_\{(.*?)\})?.*", line):
+            found.append(match.groups())
+    return found
+
+
+@pytest.mark.parametrize("shape", [(3,), (10,), (3, 4), (2, 3, 2)])
+def test_latex_gives_an_output_the_subscript_of_the_entry_it_copies(shape):
+    emitter = importlib.import_module("epigauge_derive.emitters.latex")
+    a = Input("a", shape)
+    copied = Output("copy", shape, tuple(a.entries()))
+    (text,) = emitter.emit([compile_kernel(Kernel("copy", "copy = a.", (a,), (copied,)))]).values()
+    lines = subscripts(text)
+    assert [left for _, left, _ in lines] == [right for *_, right in lines]
+    assert [left for _, left, _ in lines] == ["".join(map(str, i)) for i in np.ndindex(*shape)]
+
+
+def test_latex_names_the_entries_of_a_sparse_output_and_tells_two_digits_apart():
+    emitter = importlib.import_module("epigauge_derive.emitters.latex")
+    entries = [sp.S.Zero] * 144
+    entries[2 * 12 + 11], entries[11 * 12 + 3] = X, Y
+    kernel = Kernel("sparse", "two entries.", INPUTS, (Output("s", (12, 12), tuple(entries)),))
+    (text,) = emitter.emit([compile_kernel(kernel)]).values()
+    assert r"\mathtt{s} &= 0 \text{ but for}" in text
+    assert [left for _, left, _ in subscripts(text)] == ["2,11", "11,3"]

@@ -449,8 +449,37 @@ def test_pseudo_object_space_derivatives(eta):
     assert_jacobian(lambda x: K.pseudo_object_space(eta, P, x, q)[0], X, J_X)
 
 
+def test_blocks_of_a_gauge_transformation():
+    rng = np.random.default_rng(13)
+    T, P, Q = rng.standard_normal((4, 4)), rng.standard_normal((3, 4)), rng.standard_normal(4)
+    inverse, gamma, alpha = np.linalg.inv(T), 1.7, -0.6
+    camera, point = K.camera_transformation(T, gamma), K.point_transformation(inverse, alpha)
+    assert_jacobian(lambda P: (gamma * P @ T).ravel(), P, camera.reshape(12, 3, 4))
+    assert_jacobian(lambda Q: alpha * inverse @ Q, Q, point)
+    for W, block in zip(K.implicit_damping(T, inverse, gamma, alpha), (camera, point), strict=True):
+        assert distance(block.T @ W @ block, np.eye(len(block))) <= 1e-12
+
+
+@pytest.mark.parametrize("count", [1, 9, 700])
+def test_equations_of_the_8_point_algorithm(count):
+    # Weights of zero and one tell which matches count; others weigh the equations.
+    rng = np.random.default_rng(14)
+    q1, q2, F = (rng.standard_normal(s) for s in ((2, count), (2, count), (3, 3)))
+    weight = rng.choice([0.0, 0.5, 1.0], count)
+    _, row = K.algebraic(F, q1, q2)
+    A = row.reshape(9, count)
+    N, g = K.algebraic_normal(q1, q2, weight), K.algebraic_gradient(F, q1, q2, weight)
+    assert distance(N, ((A * weight) @ A.T)[UPPER]) <= 1e-14
+    assert distance(g, (A * weight) @ A.T @ F.ravel()) <= 1e-14
+
+
 def test_every_derivative_is_checked_here():
     checked = {
+        "camera_transformation",
+        "point_transformation",
+        "implicit_damping",
+        "algebraic_normal",
+        "algebraic_gradient",
         *LOSSES,
         "pseudo_object_space",
         "rotation_derivatives",
@@ -473,6 +502,7 @@ def test_every_derivative_is_checked_here():
     # Names of outputs that are no derivatives.
     values = {"r", "F", "P2", "R", "U_new", "V_new", "M_new", "sigma_new", "q_hat", "depth"}
     values |= {"R1", "R2", "s", "b1", "b2", "f", "multiplier", "last_change", "d", "e"}
+    values |= {"moved"}
     derived = {n for n, s in SIGNATURES.items() if {a.name for a in s.outputs} - values}
     # Parts of normal equations: test_bundle.py, test_joint.py compare them with their definition.
     derived -= {name for name, s in SIGNATURES.items() if s.family in ("bundle", "joint")}

@@ -174,3 +174,27 @@ def test_block_chart_has_rank_7_even_at_sigma_1(table, case):
     values = np.linalg.svd(dF, compute_uv=False)
     # Epipoles move F by its second singular value.
     assert values[-1] >= 0.5 * min(1.0, float(sigma))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_block_fundamental_is_that_of_its_factors(table, case):
+    U, V, sigma = CASES[case]
+    M = np.random.default_rng(6).standard_normal((2, 2))
+    assert distance(table.block_fundamental(U, V, M), U[:, :2] @ M @ V[:, :2].T) <= 1e-15
+
+
+def test_fundamental_of_other_coordinates_keeps_the_epipolar_constraint(table):
+    rng = np.random.default_rng(7)
+    F, a, b = rng.standard_normal((3, 3)), 3.0, 0.4
+    shifts = rng.standard_normal((2, 2))
+    moved = table.fundamental_of_coordinates(F, a, b, *shifts)
+    assert np.linalg.norm(moved) == pytest.approx(1.0, rel=1e-14)
+    p = np.concatenate([rng.standard_normal((2, 2, 20)), np.ones((2, 1, 20))], axis=1)
+    q = [(a * points[:2] + shift[:, None]) / b for points, shift in zip(p, shifts, strict=True)]
+    q = [np.vstack([points, np.ones(20)]) for points in q]
+    new = np.einsum("in,ij,jn->n", p[1], moved, p[0])
+    old = np.einsum("in,ij,jn->n", q[1], F, q[0])
+    np.testing.assert_allclose(new / new[0], old / old[0], rtol=1e-11)
+    # There and back.
+    back = table.fundamental_of_coordinates(moved, b / a, 1.0, *(-shifts / a))
+    assert same_up_to_scale(back, F, 1e-14)

@@ -7,6 +7,7 @@ from typing import Any
 import many_views
 import numpy as np
 import pytest
+from epigauge import kernels
 from epigauge.multi_view import dampings
 from epigauge.multi_view.gauge import Transformation
 from epigauge.multi_view.problem import BundleProblem, Linearized
@@ -136,17 +137,29 @@ class TestImplicit:
             expected = T.swapaxes(1, 2) @ b @ T
             assert distance(a / np.abs(expected).max(), expected / np.abs(expected).max()) < 1e-9
 
-    def test_of_lambda_I_is_eq9(self) -> None:
-        _, state, system = many_views.small_system(N_VIEWS, N_POINTS)
-        gauge = many_views.eg.gauge.normalized()
-        there = gauge.transformation(state.P, state.Q)
-        # T~^T T~ with the T that leads into the gauge; the paper's T leads from it.
-        cameras, points = dampings.Implicit(dampings.Levenberg(), gauge).matrix(system)
-        for i, gamma in enumerate(there.camera_scales):
-            expected = np.kron(np.eye(3), gamma**2 * there.T @ there.T.T)
+    def test_of_lambda_I_is_eq9_with_the_scales_inverse(self) -> None:
+        # Basis and scales by themselves: a gauge that finds both together would hide the exponents.
+        _, _, system = many_views.small_system(N_VIEWS, N_POINTS)
+        rng = np.random.default_rng(5)
+        T = np.eye(4) + 0.3 * rng.standard_normal((4, 4))
+        gamma, alpha = rng.uniform(0.3, 3.0, N_VIEWS), rng.uniform(-3.0, -0.3, N_POINTS)
+
+        class Elsewhere:
+            def transformation(self, P: Array, Q: Array) -> Any:
+                # The paper's T leads from where W = I to here; a gauge's leads there.
+                return many_views.eg.gauge.Transformation(T, gamma, alpha).inverse()
+
+        cameras, points = dampings.Implicit(dampings.Levenberg(), Elsewhere()).matrix(system)
+        A = T.T @ T
+        for i in range(N_VIEWS):
+            expected = np.kron(np.eye(3), np.linalg.inv(A) / gamma[i] ** 2)
             assert distance(cameras[i], expected) < 1e-12
-        for j, alpha in enumerate(there.point_scales):
-            assert distance(points[j], alpha**2 * np.linalg.inv(there.T @ there.T.T)) < 1e-9
+            assert distance(cameras[i], expected * gamma[i] ** 4) > 0.1  # as printed
+        for j in range(N_POINTS):
+            assert distance(points[j], A / alpha[j] ** 2) < 1e-12
+        kernel = kernels.table("numpy").implicit_damping(T, np.linalg.inv(T), gamma[0], alpha[0])
+        assert distance(cameras[0], kernel[0]) < 1e-12
+        assert distance(points[0], kernel[1]) < 1e-12
 
     def test_of_the_covariant_damping_is_itself(self) -> None:
         _, _, system = many_views.small_system(N_VIEWS, N_POINTS)
@@ -234,6 +247,49 @@ class TestTable1:
             v = v * (b / self.size("product", v)) ** 0.25
             assert self.size("product", v) == pytest.approx(b, rel=1e-12)
             assert np.trace(R_T.T @ G @ R_T) > (1.0 + 1e-6) * np.trace(v.T @ G @ v)
+
+    def test_in_neither_reading_W_exists_for_a_camera(self, grams: Any) -> None:
+        # Three rows, three gradients: G has rank 3 of 4.
+        system, blocks = grams
+        for G, b in blocks:
+            values = np.linalg.eigvalsh(G)
+            assert (values[0] < 1e-12 * values[3]) == (b == 12.0)
+            assert values[1] > 1e-12 * values[3]
+        for norm in ("product", "factor"):
+            for R_T in self.factors(norm, system)[:-1]:
+                assert np.linalg.matrix_rank(R_T @ R_T.T, tol=1e-9) < 4
+
+    def test_b_of_a_camera_is_three_times_that_of_the_identity(self, grams: Any) -> None:
+        # The paper normalises "as the standard choice": |W|^2 = |I|^2 = p, 4 for each 4x4 block.
+        system, _ = grams
+        cameras, points = dampings.GaugeInvariant("product").directions(system)
+        identities = np.eye(12), np.eye(4)
+        for block, identity, ratio in zip((cameras[0], points[0]), identities, (3, 1), strict=True):
+            size = float(np.sum((block @ block.T) ** 2))
+            assert size == pytest.approx(ratio * np.sum(identity**2), rel=1e-12)
+
+    def test_the_first_normalisation_of_section_6_has_no_maximum(self) -> None:
+        # max g^T W^-1 g over |W|^2 = p: an eigenvalue along g that goes to zero.
+        _, _, system = many_views.small_system(N_VIEWS, N_POINTS)
+        g, p = system.gradient, len(system.gradient)
+        unit = g / np.linalg.norm(g)
+        values = []
+        for along in (1.0, 1e-2, 1e-4):
+            W = np.eye(p) + (along - 1.0) * np.outer(unit, unit)
+            W *= np.sqrt(p) / np.linalg.norm(W)
+            values.append(g @ np.linalg.solve(W, g))
+        assert values[2] > 90.0 * values[1] > 8000.0 * values[0]
+
+    @pytest.mark.parametrize("norm", ["product", "factor"])
+    def test_a_larger_lambda_shortens_the_step_as_in_section_6(self, norm: str) -> None:
+        # With Table 1's W^-1 = lambda R^T R a rejected step would be followed by a longer one.
+        _, _, system = many_views.small_system(N_VIEWS, N_POINTS)
+        damping = dampings.GaugeInvariant(norm)
+        start = damping.start(system)
+        lengths = [np.linalg.norm(damping.step(system, start * 10.0**k)) for k in range(10)]
+        assert (np.diff(lengths) < 0.0).all()
+        # Far out, delta = -R^T R g / lambda.
+        assert lengths[-1] == pytest.approx(0.1 * lengths[-2], rel=0.05)
 
     @pytest.mark.parametrize("norm", ["product", "factor"])
     @pytest.mark.parametrize("lam", [1e-2, 1.0, 1e3])

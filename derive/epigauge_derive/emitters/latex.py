@@ -1,4 +1,7 @@
-"""LaTeX formulas of the same programs, one file a kernel, for documentation and papers."""
+"""LaTeX formulas of the same programs, one file a kernel, for documentation and papers.
+
+Subscripts count from zero, as in the code.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +46,9 @@ def _equations(assignments: Assignments, arrow: str = "=") -> list[str]:
 
 
 def _entry(name: str, index: tuple[int, ...], summed: bool) -> str:
-    # Two-digit positions are told apart by a comma.
-    separator = "," if any(position >= 9 for position in index) else ""
-    subscript = separator.join(str(position + 1) for position in index)
+    # Counted from zero, as symbols of inputs are; a comma tells two-digit positions apart.
+    separator = "," if any(position > 9 for position in index) else ""
+    subscript = separator.join(map(str, index))
     text = rf"\mathtt{{{name.replace('_', chr(92) + '_')}}}"
     text += f"_{{{subscript}}}" if subscript else ""
     return text + (r" &= \sum" if summed else " &=")

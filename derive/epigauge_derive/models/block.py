@@ -61,6 +61,12 @@ def kernels() -> list[Kernel]:
     u_new, v_new, m_new = updated()
     return [
         Kernel(
+            "block_fundamental",
+            "F = U12 M V12^T.",
+            FACTORS,
+            (Output.of("F", fundamental(*plain)),),
+        ),
+        Kernel(
             "block_derivatives",
             "F = U12 M V12^T with first and second derivatives of vect(F) by the seven update "
             "parameters (x1, x2, y1, y2, and three of M), at no update.",

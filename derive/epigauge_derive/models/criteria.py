@@ -45,6 +45,7 @@ def kernels() -> list[Kernel]:
     )
     return [
         _residual("algebraic", "r = q'^T F q (B&S section 4).", [constraint()]),
+        *_eight_point(),
         _residual("epipolar", lines, epipolar()),
         *_normal_equations("epipolar", epipolar()),
         _residual("sampson", weighted, sampson()),
@@ -57,6 +58,29 @@ def _residual(name: str, formula: str, residuals: list[sp.Expr]) -> Kernel:
     shape = (len(residuals), 9)
     outputs = (Output.of("r", residuals), Output("dr_dF", shape, tuple(derivatives)))
     return Kernel(name, formula, (F, Q1, Q2), outputs)
+
+
+def _eight_point() -> list[Kernel]:
+    """Return A^T A of the linear equations A vect(F) = 0, and its product with vect(F)."""
+    weight = Input("weight")
+    row = jacobian([constraint()], F.entries())
+    normal = Output.of("N", upper(weight.symbol() * row.T * row), summed=True)
+    product = Output.of("g", weight.symbol() * constraint() * row.T, summed=True)
+    return [
+        Kernel(
+            "algebraic_normal",
+            "A^T A (upper triangle) of the equations A vect(F) = 0 of the 8-point algorithm, a "
+            "row of A being d(q'^T F q) / d vect(F).",
+            (Q1, Q2, weight),
+            (normal,),
+        ),
+        Kernel(
+            "algebraic_gradient",
+            "A^T A vect(F), from the residuals q'^T F q and not from A^T A (8-point algorithm).",
+            (F, Q1, Q2, weight),
+            (product,),
+        ),
+    ]
 
 
 def _normal_equations(name: str, residuals: list[sp.Expr]) -> list[Kernel]:

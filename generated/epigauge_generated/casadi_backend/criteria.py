@@ -48,6 +48,140 @@ def algebraic():
 
 
 @cache
+def algebraic_normal():
+    # Formula: A^T A (upper triangle) of the equations A vect(F) = 0 of the 8-point algorithm, a
+    # row of A being d(q'^T F q) / d vect(F).
+    # Inputs:  q1 (2,), q2 (2,), weight ()
+    # Outputs: N (45,) summed
+    # Operations: 39, temporaries: 20.
+    q1 = ca.SX.sym("q1", 2, 1)
+    q1_0 = q1[0, 0]
+    q1_1 = q1[1, 0]
+    q2 = ca.SX.sym("q2", 2, 1)
+    q2_0 = q2[0, 0]
+    q2_1 = q2[1, 0]
+    weight = ca.SX.sym("weight", 1, 1)
+    t0 = q1_0*q1_0
+    t1 = q2_0*q2_0*weight
+    t2 = q1_0*t1
+    t3 = q2_0*weight
+    t4 = t0*t3
+    t5 = q1_0*t3
+    t6 = q2_1*t5
+    t7 = q1_1*t6
+    t8 = q1_1*t5
+    t9 = q1_1*q1_1
+    t10 = t3*t9
+    t11 = q1_1*t3
+    t12 = q2_1*t11
+    t13 = q2_1*q2_1*weight
+    t14 = q1_0*t13
+    t15 = q2_1*weight
+    t16 = q1_0*t15
+    t17 = q1_1*t16
+    t18 = q1_1*t15
+    t19 = q1_0*weight
+    N = ca.SX(45, 1)
+    N[0, 0] = t0*t1
+    N[1, 0] = q1_1*t2
+    N[2, 0] = t2
+    N[3, 0] = q2_1*t4
+    N[4, 0] = t7
+    N[5, 0] = t6
+    N[6, 0] = t4
+    N[7, 0] = t8
+    N[8, 0] = t5
+    N[9, 0] = t1*t9
+    N[10, 0] = q1_1*t1
+    N[11, 0] = t7
+    N[12, 0] = q2_1*t10
+    N[13, 0] = t12
+    N[14, 0] = t8
+    N[15, 0] = t10
+    N[16, 0] = t11
+    N[17, 0] = t1
+    N[18, 0] = t6
+    N[19, 0] = t12
+    N[20, 0] = q2_1*t3
+    N[21, 0] = t5
+    N[22, 0] = t11
+    N[23, 0] = t3
+    N[24, 0] = t0*t13
+    N[25, 0] = q1_1*t14
+    N[26, 0] = t14
+    N[27, 0] = t0*t15
+    N[28, 0] = t17
+    N[29, 0] = t16
+    N[30, 0] = t13*t9
+    N[31, 0] = q1_1*t13
+    N[32, 0] = t17
+    N[33, 0] = t15*t9
+    N[34, 0] = t18
+    N[35, 0] = t13
+    N[36, 0] = t16
+    N[37, 0] = t18
+    N[38, 0] = t15
+    N[39, 0] = t0*weight
+    N[40, 0] = q1_1*t19
+    N[41, 0] = t19
+    N[42, 0] = t9*weight
+    N[43, 0] = q1_1*weight
+    N[44, 0] = weight
+    return ca.Function(
+        "algebraic_normal",
+        [q1, q2, weight],
+        [N],
+        ["q1", "q2", "weight"],
+        ["N"],
+    )
+
+
+@cache
+def algebraic_gradient():
+    # Formula: A^T A vect(F), from the residuals q'^T F q and not from A^T A (8-point algorithm).
+    # Inputs:  F (3, 3) shared, q1 (2,), q2 (2,), weight ()
+    # Outputs: g (9,) summed
+    # Operations: 25, temporaries: 3.
+    F = ca.SX.sym("F", 3, 3)
+    F00 = F[0, 0]
+    F01 = F[0, 1]
+    F02 = F[0, 2]
+    F10 = F[1, 0]
+    F11 = F[1, 1]
+    F12 = F[1, 2]
+    F20 = F[2, 0]
+    F21 = F[2, 1]
+    F22 = F[2, 2]
+    q1 = ca.SX.sym("q1", 2, 1)
+    q1_0 = q1[0, 0]
+    q1_1 = q1[1, 0]
+    q2 = ca.SX.sym("q2", 2, 1)
+    q2_0 = q2[0, 0]
+    q2_1 = q2[1, 0]
+    weight = ca.SX.sym("weight", 1, 1)
+    t0 = weight*(F22 + F02*q2_0 + F12*q2_1 + q1_0*(F20 + F00*q2_0 + F10*q2_1) + q1_1*(F21 + F01*q2_0 + F11*q2_1))
+    t1 = q2_0*t0
+    t2 = q2_1*t0
+    g = ca.SX(9, 1)
+    g[0, 0] = q1_0*t1
+    g[1, 0] = q1_1*t1
+    g[2, 0] = t1
+    g[3, 0] = q1_0*t2
+    g[4, 0] = q1_1*t2
+    g[5, 0] = t2
+    g[6, 0] = q1_0*t0
+    g[7, 0] = q1_1*t0
+    g[8, 0] = t0
+    return ca.Function(
+        "algebraic_gradient",
+        [F, q1, q2, weight],
+        [g],
+        ["F", "q1", "q2", "weight"],
+        ["g"],
+    )
+
+
+@cache
 def epipolar():
     # Formula: signed distances in pixels of q to the line F^T q' and of q' to the line F q (B&S
     # section 4, point-to-epipolar-line criterion).

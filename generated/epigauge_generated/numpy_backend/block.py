@@ -2,6 +2,44 @@
 import numpy as np
 
 
+def block_fundamental(U, V, M, F):
+    # Formula: F = U12 M V12^T.
+    # Inputs:  U (3, 3), V (3, 3), M (2, 2)
+    # Outputs: F (3, 3)
+    # Operations: 45, temporaries: 6.
+    U00 = U[0, 0]
+    U01 = U[0, 1]
+    U10 = U[1, 0]
+    U11 = U[1, 1]
+    U20 = U[2, 0]
+    U21 = U[2, 1]
+    V00 = V[0, 0]
+    V01 = V[0, 1]
+    V10 = V[1, 0]
+    V11 = V[1, 1]
+    V20 = V[2, 0]
+    V21 = V[2, 1]
+    M00 = M[0, 0]
+    M01 = M[0, 1]
+    M10 = M[1, 0]
+    M11 = M[1, 1]
+    t0 = M00*U00 + M10*U01
+    t1 = M01*U00 + M11*U01
+    t2 = M00*U10 + M10*U11
+    t3 = M01*U10 + M11*U11
+    t4 = M00*U20 + M10*U21
+    t5 = M01*U20 + M11*U21
+    F[0, 0] = V00*t0 + V01*t1
+    F[0, 1] = V10*t0 + V11*t1
+    F[0, 2] = V20*t0 + V21*t1
+    F[1, 0] = V00*t2 + V01*t3
+    F[1, 1] = V10*t2 + V11*t3
+    F[1, 2] = V20*t2 + V21*t3
+    F[2, 0] = V00*t4 + V01*t5
+    F[2, 1] = V10*t4 + V11*t5
+    F[2, 2] = V20*t4 + V21*t5
+
+
 def block_derivatives(U, V, M, F, dF, d2F):
     # Formula: F = U12 M V12^T with first and second derivatives of vect(F) by the seven update
     # parameters (x1, x2, y1, y2, and three of M), at no update.

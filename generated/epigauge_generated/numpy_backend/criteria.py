@@ -32,6 +32,115 @@ def algebraic(F, q1, q2, r, dr_dF):
     dr_dF[0, 8] = 1.0
 
 
+def algebraic_normal(q1, q2, weight, N):
+    # Formula: A^T A (upper triangle) of the equations A vect(F) = 0 of the 8-point algorithm, a
+    # row of A being d(q'^T F q) / d vect(F).
+    # Inputs:  q1 (2,), q2 (2,), weight ()
+    # Outputs: N (45,) summed
+    # Operations: 39, temporaries: 20.
+    q1_0 = q1[0]
+    q1_1 = q1[1]
+    q2_0 = q2[0]
+    q2_1 = q2[1]
+    t0 = q1_0*q1_0
+    t1 = q2_0*q2_0*weight
+    t2 = q1_0*t1
+    t3 = q2_0*weight
+    t4 = t0*t3
+    t5 = q1_0*t3
+    t6 = q2_1*t5
+    t7 = q1_1*t6
+    t8 = q1_1*t5
+    t9 = q1_1*q1_1
+    t10 = t3*t9
+    t11 = q1_1*t3
+    t12 = q2_1*t11
+    t13 = q2_1*q2_1*weight
+    t14 = q1_0*t13
+    t15 = q2_1*weight
+    t16 = q1_0*t15
+    t17 = q1_1*t16
+    t18 = q1_1*t15
+    t19 = q1_0*weight
+    N[0] = np.add.reduce(t0*t1, axis=-1)
+    N[1] = np.add.reduce(q1_1*t2, axis=-1)
+    N[2] = np.add.reduce(t2, axis=-1)
+    N[3] = np.add.reduce(q2_1*t4, axis=-1)
+    N[4] = np.add.reduce(t7, axis=-1)
+    N[5] = np.add.reduce(t6, axis=-1)
+    N[6] = np.add.reduce(t4, axis=-1)
+    N[7] = np.add.reduce(t8, axis=-1)
+    N[8] = np.add.reduce(t5, axis=-1)
+    N[9] = np.add.reduce(t1*t9, axis=-1)
+    N[10] = np.add.reduce(q1_1*t1, axis=-1)
+    N[11] = np.add.reduce(t7, axis=-1)
+    N[12] = np.add.reduce(q2_1*t10, axis=-1)
+    N[13] = np.add.reduce(t12, axis=-1)
+    N[14] = np.add.reduce(t8, axis=-1)
+    N[15] = np.add.reduce(t10, axis=-1)
+    N[16] = np.add.reduce(t11, axis=-1)
+    N[17] = np.add.reduce(t1, axis=-1)
+    N[18] = np.add.reduce(t6, axis=-1)
+    N[19] = np.add.reduce(t12, axis=-1)
+    N[20] = np.add.reduce(q2_1*t3, axis=-1)
+    N[21] = np.add.reduce(t5, axis=-1)
+    N[22] = np.add.reduce(t11, axis=-1)
+    N[23] = np.add.reduce(t3, axis=-1)
+    N[24] = np.add.reduce(t0*t13, axis=-1)
+    N[25] = np.add.reduce(q1_1*t14, axis=-1)
+    N[26] = np.add.reduce(t14, axis=-1)
+    N[27] = np.add.reduce(t0*t15, axis=-1)
+    N[28] = np.add.reduce(t17, axis=-1)
+    N[29] = np.add.reduce(t16, axis=-1)
+    N[30] = np.add.reduce(t13*t9, axis=-1)
+    N[31] = np.add.reduce(q1_1*t13, axis=-1)
+    N[32] = np.add.reduce(t17, axis=-1)
+    N[33] = np.add.reduce(t15*t9, axis=-1)
+    N[34] = np.add.reduce(t18, axis=-1)
+    N[35] = np.add.reduce(t13, axis=-1)
+    N[36] = np.add.reduce(t16, axis=-1)
+    N[37] = np.add.reduce(t18, axis=-1)
+    N[38] = np.add.reduce(t15, axis=-1)
+    N[39] = np.add.reduce(t0*weight, axis=-1)
+    N[40] = np.add.reduce(q1_1*t19, axis=-1)
+    N[41] = np.add.reduce(t19, axis=-1)
+    N[42] = np.add.reduce(t9*weight, axis=-1)
+    N[43] = np.add.reduce(q1_1*weight, axis=-1)
+    N[44] = np.add.reduce(weight, axis=-1)
+
+
+def algebraic_gradient(F, q1, q2, weight, g):
+    # Formula: A^T A vect(F), from the residuals q'^T F q and not from A^T A (8-point algorithm).
+    # Inputs:  F (3, 3) shared, q1 (2,), q2 (2,), weight ()
+    # Outputs: g (9,) summed
+    # Operations: 25, temporaries: 3.
+    F00 = F[0, 0]
+    F01 = F[0, 1]
+    F02 = F[0, 2]
+    F10 = F[1, 0]
+    F11 = F[1, 1]
+    F12 = F[1, 2]
+    F20 = F[2, 0]
+    F21 = F[2, 1]
+    F22 = F[2, 2]
+    q1_0 = q1[0]
+    q1_1 = q1[1]
+    q2_0 = q2[0]
+    q2_1 = q2[1]
+    t0 = weight*(F22 + F02*q2_0 + F12*q2_1 + q1_0*(F20 + F00*q2_0 + F10*q2_1) + q1_1*(F21 + F01*q2_0 + F11*q2_1))
+    t1 = q2_0*t0
+    t2 = q2_1*t0
+    g[0] = np.add.reduce(q1_0*t1, axis=-1)
+    g[1] = np.add.reduce(q1_1*t1, axis=-1)
+    g[2] = np.add.reduce(t1, axis=-1)
+    g[3] = np.add.reduce(q1_0*t2, axis=-1)
+    g[4] = np.add.reduce(q1_1*t2, axis=-1)
+    g[5] = np.add.reduce(t2, axis=-1)
+    g[6] = np.add.reduce(q1_0*t0, axis=-1)
+    g[7] = np.add.reduce(q1_1*t0, axis=-1)
+    g[8] = np.add.reduce(t0, axis=-1)
+
+
 def epipolar(F, q1, q2, r, dr_dF):
     # Formula: signed distances in pixels of q to the line F^T q' and of q' to the line F q (B&S
     # section 4, point-to-epipolar-line criterion).

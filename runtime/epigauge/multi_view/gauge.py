@@ -15,6 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from epigauge import kernels
 from epigauge._arguments import as_real
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.tracks import Reconstruction
@@ -90,8 +91,10 @@ class Transformation:
         cameras, points : ndarray, shape (n, 12, 12), (m, 4, 4)
             They act on vect(P_i) and on Q_j.
         """
-        cameras = self.camera_scales[:, None, None] * np.asarray(np.kron(np.eye(3), self.T.T))
-        return cameras, self.point_scales[:, None, None] * np.linalg.inv(self.T)
+        table, inverse = kernels.table("numpy"), np.linalg.inv(self.T)
+        cameras = table.camera_transformation(self.T[..., None], self.camera_scales)
+        points = table.point_transformation(inverse[..., None], self.point_scales)
+        return np.moveaxis(cameras, -1, 0), np.moveaxis(points, -1, 0)
 
 
 class Gauge(Protocol):

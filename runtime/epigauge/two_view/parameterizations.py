@@ -170,8 +170,7 @@ class Block:
 
     def fundamental(self, estimate: BlockF) -> Array:
         """Return F."""
-        U, V, M = estimate
-        return np.asarray(U[:, :2] @ M @ V[:, :2].T)
+        return np.asarray(self._kernels.block_fundamental(*estimate))
 
     def derivatives(self, estimate: BlockF) -> tuple[Array, Array]:
         """Return the derivatives of F."""
@@ -252,7 +251,7 @@ class Maps:
         entries = np.ix_(back2, back1)
         # [S' e']_x = det(S') S' [e']_x S'^T: an odd order turns the sign of [e']_x F.
         signs = np.array([*3 * [np.linalg.det(np.eye(3)[back2])], 1.0])
-        rows = np.ix_(back2, [*back1, 3])
+        rows = np.ix_(back2, np.append(back1, 3))
         return (
             F[entries],
             dF.reshape(3, 3, 7)[entries].reshape(9, 7),
