@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 from epigauge_derive import emitters
+from epigauge_derive.camera_model import camera_models
 from epigauge_derive.kernel import kernels
 from epigauge_derive.program import compile_kernel
 
@@ -20,10 +21,12 @@ _NOT_OURS = ("__pycache__",)
 def generate() -> dict[str, str]:
     """Return the text of every generated file by its path below generated/."""
     programs = [compile_kernel(kernel) for kernel in kernels()]
+    models = list(camera_models())
     files: dict[str, str] = {}
     for module in sorted(m.name for m in pkgutil.iter_modules(emitters.__path__)):
         if not module.startswith("_"):
-            files |= importlib.import_module(f"epigauge_derive.emitters.{module}").emit(programs)
+            emitter = importlib.import_module(f"epigauge_derive.emitters.{module}")
+            files |= emitter.emit(programs, models)
     return files
 
 

@@ -7,6 +7,7 @@ axis, which is always the last one.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -24,6 +25,12 @@ class select(sp.Function):
     nargs = 3
 
 
+class floor(sp.Function):
+    """The largest whole number that is not above x; a step, of which no derivative is taken."""
+
+    nargs = 1
+
+
 class log1p(sp.Function):
     """log(1 + x), exact for small x."""
 
@@ -36,19 +43,30 @@ class log1p(sp.Function):
 
 @dataclass(frozen=True)
 class Input:
-    """An array argument. A shared one has the same value for all observations of a call."""
+    """An array argument. A shared one has the same value for all observations of a call.
+
+    Its entries may have names of their own, row by row.
+    """
 
     name: str
     shape: Shape = ()
     shared: bool = False
+    names: tuple[str, ...] = ()
 
     def entries(self) -> list[sp.Symbol]:
-        """Return one real symbol an entry, row by row: ``F00 F01 ...``; a scalar is ``sigma``."""
-        if any(extent > 10 for extent in self.shape):
-            raise ValueError(f"input {self.name}: extents above 10 make its entry names ambiguous")
-        separator = "_" if self.name[-1].isdigit() else ""
+        """Return one real symbol an entry, row by row.
+
+        Without own names: ``F00 F01 ...``, ``delta_0 delta_1 ... delta_11``, and ``sigma`` of a
+        scalar.
+        """
+        if self.names:
+            if len(self.names) != math.prod(self.shape):
+                raise ValueError(f"input {self.name}: {len(self.names)} names for {self.shape}")
+            return [sp.Symbol(name, real=True) for name in self.names]
+        long = any(extent > 10 for extent in self.shape)
+        first = "_" if self.shape and (long or self.name[-1].isdigit()) else ""
         return [
-            sp.Symbol(self.name + separator * bool(index) + "".join(map(str, index)), real=True)
+            sp.Symbol(self.name + first + ("_" * long).join(map(str, index)), real=True)
             for index in itertools.product(*map(range, self.shape))
         ]
 
@@ -126,7 +144,8 @@ class Kernel:
         Whether C computes stage after stage for a chunk of observations, in loops short enough for
         the registers, rather than all stages in one loop. A pass of a `Loop` is a stage, too.
     family : str
-        Model file the kernel comes from; filled in by the registry.
+        Model file the kernel comes from, below `models/` and without ending; filled in by the
+        registry.
     """
 
     name: str
@@ -161,6 +180,11 @@ def derivatives_at(
     return at(sp.Matrix(first), point), sp.Array(second)
 
 
+def cross(w: Sequence[sp.Expr]) -> sp.Matrix:
+    """Return [w]_x, the matrix of the cross product with w."""
+    return sp.Matrix([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+
+
 def upper(matrix: sp.Matrix) -> list[sp.Expr]:
     """Pack a symmetric matrix: its upper triangle, row by row."""
     return [matrix[i, j] for i in range(matrix.rows) for j in range(i, matrix.cols)]
@@ -178,10 +202,16 @@ def kernels() -> Iterator[Kernel]:
     from dataclasses import replace
 
     from epigauge_derive import models
+    from epigauge_derive.camera_model import camera_models
 
+    names = sorted(m.name for m in pkgutil.iter_modules(models.__path__) if not m.ispkg)
+    families = {
+        name: importlib.import_module(f"epigauge_derive.models.{name}").kernels() for name in names
+    }
+    families |= {model.family: model.kernels() for model in camera_models()}
     seen: set[str] = set()
-    for family in sorted(module.name for module in pkgutil.iter_modules(models.__path__)):
-        for kernel in importlib.import_module(f"epigauge_derive.models.{family}").kernels():
+    for family, members in families.items():
+        for kernel in members:
             if kernel.name in seen:
                 raise ValueError(f"two kernels are named {kernel.name}")
             seen.add(kernel.name)

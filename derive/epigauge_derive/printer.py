@@ -20,7 +20,8 @@ class Printer:
     Parameters
     ----------
     functions : mapping
-        Spelling of ``sqrt``, ``sin``, ``cos``, ``atan2``, ``abs``, ``log1p``.
+        Spelling of ``sqrt``, ``sin``, ``cos``, ``atan2``, ``abs``, ``floor``,
+        ``log1p``.
     select : str
         Format of the branch with fields ``condition``, ``then`` and ``other``.
     """
@@ -42,6 +43,8 @@ class Printer:
             return e.name, _ATOM
         if e.is_Number:
             return self._number(e)
+        if e.is_NumberSymbol:
+            return repr(float(e)), _ATOM
         if e.is_Add:
             return self._sum(e), _SUM
         if e.is_Mul:

@@ -661,4 +661,215 @@ EG_EXPORT void eg_rotation_derivatives(
     double *EG_RESTRICT dU,
     double *EG_RESTRICT d2U);
 
+EG_EXPORT void eg_bal_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_bal_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_bal_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_bal_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_bal_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    const double *EG_RESTRICT intrinsics,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_bal_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_bal_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_pinhole_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_pinhole_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_pinhole_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_pinhole_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_pinhole_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    const double *EG_RESTRICT intrinsics,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_pinhole_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_pinhole_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_projective_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_projective_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_projective_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_projective_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_projective_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_projective_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_projective_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_simple_radial_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_simple_radial_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_simple_radial_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_simple_radial_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_simple_radial_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    const double *EG_RESTRICT intrinsics,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_simple_radial_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_simple_radial_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
+/* A camera model: sizes of camera, update and point, and its kernels. */
+typedef struct {
+    const char *name;
+    int camera_size, tangent_size, point_size;
+    void (*residual)(
+        ptrdiff_t n,
+        const double *EG_RESTRICT camera,
+        const double *EG_RESTRICT X,
+        const double *EG_RESTRICT q,
+        double *EG_RESTRICT r);
+    void (*observe)(
+        ptrdiff_t n,
+        const double *EG_RESTRICT camera,
+        const double *EG_RESTRICT X,
+        const double *EG_RESTRICT q,
+        double *EG_RESTRICT r,
+        double *EG_RESTRICT J_camera,
+        double *EG_RESTRICT J_point);
+    void (*retract)(
+        ptrdiff_t n,
+        const double *EG_RESTRICT camera,
+        const double *EG_RESTRICT delta,
+        double *EG_RESTRICT moved);
+} eg_camera_model;
+
+/* All models; a row without name ends the table. */
+EG_EXPORT extern const eg_camera_model eg_camera_models[];
+
 #endif

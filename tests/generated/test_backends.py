@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from epigauge import kernels
 from epigauge.kernels import SIGNATURES
+from epigauge_generated.signatures import MODELS
 from laws import distance, factor_cases, fundamental_cases, matches, orthonormal
 
 NUMPY = kernels.table("numpy")
@@ -19,6 +20,7 @@ TRANSCENDENTAL = {
     "block_retract",
     "bilinear_frame",
     "loss_cauchy",
+    *(f"{model.prefix}_retract" for model in MODELS.values() if model.metric),
 }
 SUMMED = {name for name, s in SIGNATURES.items() if not all(a.batched for a in s.outputs)}
 #: The kernels that take the matches of one F.
@@ -67,13 +69,14 @@ def inputs(name, batch, seed, F=None):
     q1, q2 = q1.reshape(2, *batch), q2.reshape(2, *batch)
     foot_point = NUMPY.foot_point_safe_each if each else NUMPY.foot_point_safe
     factors = list(factor_cases(seed).values())
+    shapes = {argument.name: argument.shape for argument in signature.inputs}
     special = {
         "U": lambda: pool([U for U, _, _ in factors], batch, rng),
         "V": lambda: pool([V for _, V, _ in factors], batch, rng),
         "sigma": lambda: pool([sigma for _, _, sigma in factors], batch, rng),
         "M": lambda: pool([orthonormal(rng)[:2, :2] for _ in range(5)], batch, rng),
         "theta": lambda: rng.uniform(-4.0, 4.0, (3, *batch)),
-        "delta": lambda: rng.uniform(-4.0, 4.0, (7, *batch)),
+        "delta": lambda: rng.uniform(-4.0, 4.0, (*shapes["delta"], *batch)),
         "F": lambda: pool(list(fundamental_cases(seed).values()), batch, rng),
         "q1": lambda: q1,
         "q2": lambda: q2,

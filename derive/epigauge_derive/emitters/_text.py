@@ -22,6 +22,16 @@ def families(programs: Iterable[Program]) -> dict[str, list[Program]]:
     return grouped
 
 
+def module(family: str) -> str:
+    """Return the name of the files of a family: ``cameras/bal`` gives ``cameras_bal``."""
+    return family.replace("/", "_")
+
+
+def quoted(text: str) -> str:
+    """Return a string constant, alike in C and Python."""
+    return f'"{text}"'
+
+
 def file_header(family: str, comment: str) -> str:
     """Return the first line of a generated file; `comment` is a format such as ``# {}``."""
     source = f"derive/epigauge_derive/models/{family}.py" if family else "derive/epigauge_derive"

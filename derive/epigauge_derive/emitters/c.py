@@ -9,15 +9,19 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 
 import sympy as sp
 
+from epigauge_derive.camera_model import CameraModel
 from epigauge_derive.emitters._staged import Part, parts
 from epigauge_derive.emitters._text import (
     families,
     file_header,
     kernel_header,
+    module,
     mostly_zero,
+    quoted,
     used_entries,
 )
 from epigauge_derive.kernel import Input, Kernel
@@ -25,7 +29,15 @@ from epigauge_derive.printer import Printer
 from epigauge_derive.program import Assignments, Program, Repeat
 
 _printer = Printer(
-    {"sqrt": "sqrt", "sin": "sin", "cos": "cos", "atan2": "atan2", "abs": "fabs", "log1p": "log1p"},
+    {
+        "sqrt": "sqrt",
+        "sin": "sin",
+        "cos": "cos",
+        "atan2": "atan2",
+        "abs": "fabs",
+        "floor": "floor",
+        "log1p": "log1p",
+    },
     select="({condition} > 0.0 ? {then} : {other})",
 )
 
@@ -65,23 +77,72 @@ EG_EXPORT const char *eg_digest(void);
 """
 
 
-def emit(programs: list[Program]) -> dict[str, str]:
+_TABLE = """/* A camera model: sizes of camera, update and point, and its kernels. */
+typedef struct {
+    const char *name;
+    int camera_size, tangent_size, point_size;
+    void (*residual)(
+        ptrdiff_t n,
+        const double *EG_RESTRICT camera,
+        const double *EG_RESTRICT X,
+        const double *EG_RESTRICT q,
+        double *EG_RESTRICT r);
+    void (*observe)(
+        ptrdiff_t n,
+        const double *EG_RESTRICT camera,
+        const double *EG_RESTRICT X,
+        const double *EG_RESTRICT q,
+        double *EG_RESTRICT r,
+        double *EG_RESTRICT J_camera,
+        double *EG_RESTRICT J_point);
+    void (*retract)(
+        ptrdiff_t n,
+        const double *EG_RESTRICT camera,
+        const double *EG_RESTRICT delta,
+        double *EG_RESTRICT moved);
+} eg_camera_model;
+
+/* All models; a row without name ends the table. */
+EG_EXPORT extern const eg_camera_model eg_camera_models[];
+
+"""
+
+
+def emit(programs: list[Program], models: Sequence[CameraModel] = ()) -> dict[str, str]:
     """Write one source file a family, their common header, and the digest of them all."""
     files = {}
     for family, members in families(programs).items():
         text = file_header(family, "/* {} */")
         text += '#include "epigauge_kernels.h"\n\n#include <math.h>\n#include <string.h>\n'
         text += "".join(_function(program) for program in members)
-        files[f"c/{family}.c"] = text
+        files[f"c/{module(family)}.c"] = text
     prototypes = "".join(f"{_prototype(program.kernel)};\n\n" for program in programs)
-    header = file_header("", "/* {} */") + _HEADER + prototypes + "#endif\n"
+    header = file_header("", "/* {} */") + _HEADER + prototypes + _TABLE + "#endif\n"
     files["c/epigauge_kernels.h"] = header
+    files["c/camera_models.c"] = _table(models)
     files["c/digest.c"] = (
         file_header("", "/* {} */")
         + '#include "epigauge_kernels.h"\n\n'
         + f'const char *eg_digest(void)\n{{\n    return "{digest(files)}";\n}}\n'
     )
     return files
+
+
+def _table(models: Sequence[CameraModel]) -> str:
+    """Return the table of camera models, over which compiled loops run."""
+    rows = []
+    for model in models:
+        sizes = [model.camera_size, model.tangent_size, model.point_size]
+        functions = [f"eg_{model.prefix}_{name}" for name in ("residual", "observe", "retract")]
+        entries = [quoted(model.prefix), *map(str, sizes), *functions]
+        rows.append(f"    {{{', '.join(entries)}}},\n")
+    return (
+        file_header("", "/* {} */")
+        + '#include "epigauge_kernels.h"\n\n#include <stddef.h>\n\n'
+        + "const eg_camera_model eg_camera_models[] = {\n"
+        + "".join(rows)
+        + "    {NULL, 0, 0, 0, NULL, NULL, NULL},\n};\n"
+    )
 
 
 def digest(files: dict[str, str]) -> str:

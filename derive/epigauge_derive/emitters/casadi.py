@@ -7,11 +7,15 @@ all others, row by row, as columns. A summed output is the contribution of one o
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
+from epigauge_derive.camera_model import CameraModel
 from epigauge_derive.emitters._text import (
     families,
     file_header,
     kernel_header,
+    module,
+    quoted,
     used_entries,
 )
 from epigauge_derive.printer import Printer
@@ -24,19 +28,20 @@ _printer = Printer(
         "cos": "ca.cos",
         "atan2": "ca.atan2",
         "abs": "ca.fabs",
+        "floor": "ca.floor",
         "log1p": "ca.log1p",
     },
     select="ca.if_else({condition} > 0.0, {then}, {other})",
 )
 
 
-def emit(programs: list[Program]) -> dict[str, str]:
+def emit(programs: list[Program], models: Sequence[CameraModel] = ()) -> dict[str, str]:
     """Write one module a family."""
     files = {"epigauge_generated/casadi_backend/__init__.py": file_header("", "# {}")}
     for family, members in families(programs).items():
         text = file_header(family, "# {}") + "from functools import cache\n\nimport casadi as ca\n"
         text += "".join(_function(program) for program in members)
-        files[f"epigauge_generated/casadi_backend/{family}.py"] = text
+        files[f"epigauge_generated/casadi_backend/{module(family)}.py"] = text
     return files
 
 
@@ -73,12 +78,8 @@ def _function(program: Program) -> str:
     for names in (inputs, outputs):
         lines.append(f"        [{', '.join(names)}],")
     for names in (inputs, outputs):
-        lines.append(f"        [{', '.join(map(_quoted, names))}],")
+        lines.append(f"        [{', '.join(map(quoted, names))}],")
     return "\n".join([*lines, "    )"]) + "\n"
-
-
-def _quoted(name: str) -> str:
-    return f'"{name}"'
 
 
 def _statement(statement: Assignments | Repeat) -> list[str]:

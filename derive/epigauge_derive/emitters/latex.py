@@ -5,13 +5,16 @@ Subscripts count from zero, as in the code.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import sympy as sp
 
+from epigauge_derive.camera_model import CameraModel
 from epigauge_derive.emitters._text import file_header, indices, kernel_header, mostly_zero
 from epigauge_derive.program import Assignments, Program, Repeat
 
 
-def emit(programs: list[Program]) -> dict[str, str]:
+def emit(programs: list[Program], models: Sequence[CameraModel] = ()) -> dict[str, str]:
     """Write one ``align*`` a kernel."""
     return {f"latex/{program.kernel.name}.tex": _text(program) for program in programs}
 

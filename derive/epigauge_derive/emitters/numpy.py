@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from epigauge_derive.camera_model import CameraModel
 from epigauge_derive.emitters._text import (
     argument_names,
     families,
     file_header,
     indices,
     kernel_header,
+    module,
     mostly_zero,
     used_entries,
 )
@@ -21,19 +25,20 @@ _printer = Printer(
         "cos": "np.cos",
         "atan2": "np.arctan2",
         "abs": "np.abs",
+        "floor": "np.floor",
         "log1p": "np.log1p",
     },
     select="np.where({condition} > 0.0, {then}, {other})",
 )
 
 
-def emit(programs: list[Program]) -> dict[str, str]:
+def emit(programs: list[Program], models: Sequence[CameraModel] = ()) -> dict[str, str]:
     """Write one module a family."""
     files = {"epigauge_generated/numpy_backend/__init__.py": file_header("", "# {}")}
     for family, members in families(programs).items():
         text = file_header(family, "# {}") + "import numpy as np\n"
         text += "".join(_function(program) for program in members)
-        files[f"epigauge_generated/numpy_backend/{family}.py"] = text
+        files[f"epigauge_generated/numpy_backend/{module(family)}.py"] = text
     return files
 
 

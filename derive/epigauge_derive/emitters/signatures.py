@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import sympy as sp
 
+from epigauge_derive.camera_model import CameraModel
 from epigauge_derive.emitters import c
-from epigauge_derive.emitters._text import file_header
+from epigauge_derive.emitters._text import file_header, module, quoted
+from epigauge_derive.gauge import gauge
 from epigauge_derive.program import Program
 
-_PROLOGUE = '''from typing import NamedTuple
+_PROLOGUE = '''from dataclasses import dataclass
+from typing import NamedTuple
 
 
 class Argument(NamedTuple):
@@ -28,10 +33,36 @@ class Signature(NamedTuple):
     formula: str
 
 
+@dataclass(frozen=True)
+class Model:
+    """A camera model.
+
+    Kernels are named ``<prefix>_project``, ``_residual``, ``_observe``, ``_retract``, ``_image``,
+    ``_camera_generators`` and ``_point_generators``. A camera is stored as its 3x4 matrix row by
+    row, then `params`. Those of `constants` are given once: no entry of an update belongs to them.
+    """
+
+    name: str
+    prefix: str
+    title: str
+    params: tuple[str, ...]
+    units: tuple[str, ...]
+    constants: tuple[str, ...]
+    camera_size: int
+    tangent_size: int
+    point_size: int
+    tangent_names: tuple[str, ...]
+    tangent_units: tuple[str, ...]
+    gauge_dimension: int
+    gauge_names: tuple[str, ...]
+    metric: bool
+    homogeneous: bool
+
+
 '''
 
 
-def emit(programs: list[Program]) -> dict[str, str]:
+def emit(programs: list[Program], models: Sequence[CameraModel] = ()) -> dict[str, str]:
     """Write signatures.py, the package around it and the provenance file."""
     rows = []
     for program in programs:
@@ -39,18 +70,19 @@ def emit(programs: list[Program]) -> dict[str, str]:
         inputs = [(a.name, a.shape, not a.shared) for a in kernel.inputs]
         outputs = [(o.name, o.shape, not o.summed) for o in kernel.outputs]
         rows.append(
-            f"    {_quoted(kernel.name)}: Signature(\n"
-            f"        {_quoted(kernel.family)},\n"
+            f"    {quoted(kernel.name)}: Signature(\n"
+            f"        {quoted(module(kernel.family))},\n"
             f"        ({''.join(map(_argument, inputs))}),\n"
             f"        ({''.join(map(_argument, outputs))}),\n"
-            f"        {_quoted(kernel.formula)},\n"
+            f"        {quoted(kernel.formula)},\n"
             "    ),\n"
         )
     text = file_header("", "# {}") + _PROLOGUE
-    text += f"C_DIGEST = {_quoted(c.digest(c.emit(programs)))}\n\n"
-    text += "SIGNATURES = {\n" + "".join(rows) + "}\n"
+    text += f"C_DIGEST = {quoted(c.digest(c.emit(programs, models)))}\n\n"
+    text += "SIGNATURES = {\n" + "".join(rows) + "}\n\n"
+    text += "MODELS = {\n" + "".join(map(_model, models)) + "}\n"
     package = file_header("", "# {}")
-    provenance = file_header("", "# {}") + f"sympy = {_quoted(sp.__version__)}\n"
+    provenance = file_header("", "# {}") + f"sympy = {quoted(sp.__version__)}\n"
     return {
         "epigauge_generated/signatures.py": text,
         "epigauge_generated/__init__.py": package,
@@ -60,10 +92,33 @@ def emit(programs: list[Program]) -> dict[str, str]:
     }
 
 
-def _quoted(text: str) -> str:
-    return f'"{text}"'
-
-
 def _argument(argument: tuple[str, tuple[int, ...], bool]) -> str:
     name, shape, batched = argument
-    return f"Argument({_quoted(name)}, {shape}, {batched}), "
+    return f"Argument({quoted(name)}, {shape}, {batched}), "
+
+
+def _model(model: CameraModel) -> str:
+    """Return a row for each name of a camera model."""
+    generators = [name for name, _ in gauge(model)]
+    values = {
+        "prefix": model.prefix,
+        "title": model.title,
+        "params": tuple(model.parameters),
+        "units": tuple(model.parameters.values()),
+        "constants": model.constants,
+        "camera_size": model.camera_size,
+        "tangent_size": model.tangent_size,
+        "point_size": model.point_size,
+        "tangent_names": tuple(model.unknowns),
+        "tangent_units": tuple(model.unknowns.values()),
+        "gauge_dimension": len(generators),
+        "gauge_names": tuple(generators),
+        "metric": model.frame.rigid,
+        "homogeneous": model.frame.point_size == 4,
+    }
+    text = ""
+    for name in (model.name, *model.aliases):
+        text += f"    {quoted(name)}: Model(\n        name={quoted(name)},\n"
+        text += "".join(f"        {key}={value!r},\n" for key, value in values.items())
+        text += "    ),\n"
+    return text
