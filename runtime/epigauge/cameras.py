@@ -141,6 +141,39 @@ def camera_model(name: str, argument: str = "model") -> CameraModel:
     raise ArgumentError(argument, f"is {name!r:.60}", f"one of {listed}{hint}")
 
 
+def check_parameters(model: str, params: ArrayLike) -> Array:
+    """Check the parameters of cameras.
+
+    Parameters
+    ----------
+    model : str
+        Name of the camera model.
+    params : array_like, shape (c, k)
+        Parameters of each camera.
+
+    Returns
+    -------
+    ndarray, shape (c, k)
+        The same; do not write into it.
+
+    Raises
+    ------
+    ArgumentError
+        As `Cameras`.
+    """
+    known = camera_model(model)
+    array = _numbers("params", params, (len(known.params),), " ".join(known.params))
+    if not len(array):
+        raise ArgumentError("params", "has no row", "a row a camera")
+    for k in known.focal:
+        bad = np.flatnonzero(~((array[:, k] >= MIN_FOCAL) & (array[:, k] <= MAX_FOCAL)))
+        if len(bad):
+            was = f"has {known.params[k]} = {array[bad[0], k]:g} in row {bad[0]}"
+            needed = f"a focal length between {MIN_FOCAL:g} and {MAX_FOCAL:g}"
+            raise ArgumentError("params", was, needed)
+    return array
+
+
 @dataclass(frozen=True, eq=False)
 class Cameras:
     """Cameras of one model, and which of them took which view.
@@ -172,11 +205,7 @@ class Cameras:
     camera_of_view: Indices
 
     def __post_init__(self) -> None:
-        model = camera_model(self.model)
-        params = _numbers("params", self.params, (len(model.params),), " ".join(model.params))
-        if not len(params):
-            raise ArgumentError("params", "has no row", "a row a camera")
-        self._check_focal(model, params)
+        params = check_parameters(self.model, self.params)
         views = as_array("camera_of_view", self.camera_of_view, "an (n,) array")
         if views.ndim != 1 or views.dtype.kind not in "iu" or not len(views):
             was = f"is {views.dtype} {views.shape}"
@@ -189,18 +218,9 @@ class Cameras:
         if len(unused):
             was = f"names no view of camera {unused[0]}"
             raise ArgumentError("camera_of_view", was, "a view of every camera: drop other cameras")
-        object.__setattr__(self, "model", model.name)
+        object.__setattr__(self, "model", str(self.model))
         object.__setattr__(self, "params", _frozen(params))
         object.__setattr__(self, "camera_of_view", _frozen(views.astype(np.intp)))
-
-    @staticmethod
-    def _check_focal(model: CameraModel, params: Array) -> None:
-        for k in model.focal:
-            bad = np.flatnonzero(~((params[:, k] >= MIN_FOCAL) & (params[:, k] <= MAX_FOCAL)))
-            if len(bad):
-                was = f"has {model.params[k]} = {params[bad[0], k]:g} for camera {bad[0]}"
-                needed = f"a focal length between {MIN_FOCAL:g} and {MAX_FOCAL:g}"
-                raise ArgumentError("params", was, needed)
 
     @property
     def of_views(self) -> Array:

@@ -8,11 +8,12 @@ Files are written under a temporary name and moved into place: a half-written on
 
 from __future__ import annotations
 
-from epigauge.io._colmap_text import save_colmap_model
+from epigauge.io._colmap_pinhole import save_colmap_model
 from epigauge.io._common import MAX_MATCHES
 from epigauge.io.matches import Matches, load_matches, save_matches
 from epigauge.io.output import plain, save_result, writing
 from epigauge.io.ply import save_ply
+from epigauge.io.scene_files import load_scene, save_scene
 from epigauge.io.tracks import (
     TrackFile,
     load_reconstruction,
@@ -28,6 +29,7 @@ __all__ = [
     "TrackFile",
     "load_matches",
     "load_reconstruction",
+    "load_scene",
     "load_track_file",
     "load_tracks",
     "plain",
@@ -36,6 +38,7 @@ __all__ = [
     "save_ply",
     "save_reconstruction",
     "save_result",
+    "save_scene",
     "save_tracks",
     "writing",
 ]
