@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from epigauge.io._colmap_pinhole import save_colmap_model
 from epigauge.io._common import MAX_MATCHES
+from epigauge.io._scene import ColmapSource, SceneSource
 from epigauge.io.matches import Matches, load_matches, save_matches
 from epigauge.io.output import plain, save_result, writing
 from epigauge.io.ply import save_ply
@@ -25,7 +26,9 @@ from epigauge.io.tracks import (
 
 __all__ = [
     "MAX_MATCHES",
+    "ColmapSource",
     "Matches",
+    "SceneSource",
     "TrackFile",
     "load_matches",
     "load_reconstruction",
