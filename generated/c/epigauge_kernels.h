@@ -259,6 +259,36 @@ EG_EXPORT void eg_error_series(
     const double *EG_RESTRICT K,
     double *EG_RESTRICT e);
 
+EG_EXPORT void eg_essential_derivatives(
+    ptrdiff_t n,
+    const double *EG_RESTRICT U,
+    const double *EG_RESTRICT V,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT dF,
+    double *EG_RESTRICT d2F);
+
+EG_EXPORT void eg_essential_camera_derivatives(
+    ptrdiff_t n,
+    const double *EG_RESTRICT U,
+    const double *EG_RESTRICT V,
+    double *EG_RESTRICT P2,
+    double *EG_RESTRICT dP2);
+
+EG_EXPORT void eg_essential_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT U,
+    const double *EG_RESTRICT V,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT U_new,
+    double *EG_RESTRICT V_new);
+
+EG_EXPORT void eg_essential_constraints(
+    ptrdiff_t n,
+    const double *EG_RESTRICT A,
+    const double *EG_RESTRICT B,
+    const double *EG_RESTRICT C,
+    double *EG_RESTRICT c);
+
 EG_EXPORT void eg_camera_transformation(
     ptrdiff_t n,
     const double *EG_RESTRICT T,

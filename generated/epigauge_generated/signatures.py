@@ -46,7 +46,7 @@ class Model:
     homogeneous: bool
 
 
-C_DIGEST = "68de6dbc1baa2a27"
+C_DIGEST = "f00b7553b3d841dd"
 
 SIGNATURES = {
     "block_fundamental": Signature(
@@ -222,6 +222,30 @@ SIGNATURES = {
         (Argument("K", (9,), True), ),
         (Argument("e", (9,), True), ),
         "e truncated at order n = 0..8, e = sum (-1)^(n+1) (1 + n/2) K(n) with K(n) = g^T (W^-1 N)^n W^-1 g (B03 eq. 10).",
+    ),
+    "essential_derivatives": Signature(
+        "essential",
+        (Argument("U", (3, 3), True), Argument("V", (3, 3), True), ),
+        (Argument("F", (3, 3), True), Argument("dF", (9, 5), True), Argument("d2F", (9, 5, 5), True), ),
+        "E = u1 v1^T + u2 v2^T with first and second derivatives of vect(E) by the five update parameters (three that turn R about fixed t, two that move t), at no update.",
+    ),
+    "essential_camera_derivatives": Signature(
+        "essential",
+        (Argument("U", (3, 3), True), Argument("V", (3, 3), True), ),
+        (Argument("P2", (3, 4), True), Argument("dP2", (12, 5), True), ),
+        "canonic P' = (u2 v1^T - u1 v2^T | u3) and d vect(P') by the five update parameters.",
+    ),
+    "essential_retract": Signature(
+        "essential",
+        (Argument("U", (3, 3), True), Argument("V", (3, 3), True), Argument("delta", (5,), True), ),
+        (Argument("U_new", (3, 3), True), Argument("V_new", (3, 3), True), ),
+        "U <- U B, V <- V A W^T B W with A = R(a), B = R(b1, b2, 0), W the quarter turn.",
+    ),
+    "essential_constraints": Signature(
+        "essential",
+        (Argument("A", (3, 3), True), Argument("B", (3, 3), True), Argument("C", (3, 3), True), ),
+        (Argument("c", (10,), True), ),
+        "symmetric trilinear form whose diagonal is (2 E E^T E - tr(E E^T) E, det E), zero for essential matrices: the coefficients of the five-point equations.",
     ),
     "camera_transformation": Signature(
         "gauge_transformations",
