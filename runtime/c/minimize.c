@@ -16,6 +16,7 @@
 #define LAM_FACTOR 10.0
 #define LAM_START 1e-3
 #define LIFT 1e-3
+#define BENT (0.375 * 0.375)
 #define TINIEST 1e-300
 
 /* Cholesky pivots above this ratio prove a condition far below that of a singular matrix. */
@@ -32,12 +33,18 @@ static double now(void)
 #endif
 }
 
+/* Parameters of the representation itself, before a basis selects some. */
+static int own_parameters(const eg_options *options)
+{
+    return options->chart == EG_ESSENTIAL ? 5 : 7;
+}
+
 static void fundamental(const eg_options *options, const eg_chart *chart, const double *motion,
                         double *F)
 {
     const double *U = motion, *V = motion + 9, *rest = motion + 18;
     double own[9];
-    if (options->chart == EG_ORTHO)
+    if (options->chart != EG_BLOCKS) /* sigma = 1 of an essential matrix, too */
         eg_fundamental_from_factors(1, U, V, rest, own);
     else
         eg_block_fundamental(1, U, V, rest, own);
@@ -50,44 +57,67 @@ static void fundamental(const eg_options *options, const eg_chart *chart, const 
 static void retract(const eg_options *options, const eg_chart *chart, const double *motion,
                     const double *step, double *moved)
 {
-    double delta[7];
+    double delta[7] = {0.0};
     if (chart->basis)
-        eg_product(7, chart->p, 1, chart->basis, step, delta);
+        eg_product(own_parameters(options), chart->p, 1, chart->basis, step, delta);
     else
-        memcpy(delta, step, sizeof delta);
-    if (options->chart == EG_ORTHO)
+        memcpy(delta, step, (size_t)chart->p * sizeof(double));
+    if (options->chart == EG_ORTHO) {
         eg_retract_factors(1, motion, motion + 9, motion + 18, delta, moved, moved + 9, moved + 18);
-    else
+    } else if (options->chart == EG_ESSENTIAL) {
+        eg_essential_retract(1, motion, motion + 9, delta, moved, moved + 9);
+        moved[18] = motion[18];
+    } else {
         eg_block_retract(1, motion, motion + 9, motion + 18, delta, moved, moved + 9, moved + 18);
+    }
+}
+
+/* J^T r'' with r'' ~ (dr/dF) d2F, from N dF (9, p) and d2F (9, n, n). */
+static inline void bend(int p, int n, const eg_chart *chart, const double *ND, const double *d2F,
+                        double *result)
+{
+    double inner[63], own[343], half[49];
+    memcpy(inner, ND, (size_t)(9 * p) * sizeof(double));
+    if (chart->entries)
+        eg_transposed_product(9, 9, p, chart->entries, ND, inner);
+    eg_transposed_product(p, 9, n * n, inner, d2F, chart->basis ? own : result);
+    if (!chart->basis)
+        return;
+    for (int k = 0; k < p; ++k) {
+        eg_product(n, n, p, own + k * n * n, chart->basis, half);
+        eg_transposed_product(p, n, p, chart->basis, half, result + k * p * p);
+    }
 }
 
 /* Gradient, Hessian and diagonal of J^T J by the p parameters. */
-static inline void chain_rule(int p, eg_matches *matches, const eg_options *options,
+static inline void chain_rule(int p, int n, eg_matches *matches, const eg_options *options,
                               const eg_chart *chart, const double *motion, eg_outcome *state)
 {
     double g[9], H[81], own[9], dF[63], d2F[441], DF[63], HD[63], second[49];
     eg_normal(matches, options, state->F, g, state->normal, H);
     if (options->chart == EG_ORTHO)
         eg_fundamental_derivatives(1, motion, motion + 9, motion + 18, own, dF, d2F);
+    else if (options->chart == EG_ESSENTIAL)
+        eg_essential_derivatives(1, motion, motion + 9, own, dF, d2F);
     else
         eg_block_derivatives(1, motion, motion + 9, motion + 18, own, dF, d2F);
     const double *first = dF;
     double inner[9];
     memcpy(inner, g, sizeof inner);
     if (chart->entries) {
-        eg_product(9, 9, 7, chart->entries, dF, DF);
+        eg_product(9, 9, n, chart->entries, dF, DF);
         eg_transposed_product(9, 9, 1, chart->entries, g, inner);
-        memcpy(dF, DF, sizeof DF);
+        memcpy(dF, DF, (size_t)(9 * n) * sizeof(double));
     }
     if (options->exact)
-        eg_transposed_product(1, 9, 49, inner, d2F, second);
+        eg_transposed_product(1, 9, n * n, inner, d2F, second);
     if (chart->basis) {
         double half[49];
-        eg_product(9, 7, p, dF, chart->basis, DF);
+        eg_product(9, n, p, dF, chart->basis, DF);
         first = DF;
         if (options->exact) {
-            eg_product(7, 7, p, second, chart->basis, half);
-            eg_transposed_product(p, 7, p, chart->basis, half, second);
+            eg_product(n, n, p, second, chart->basis, half);
+            eg_transposed_product(p, n, p, chart->basis, half, second);
         }
     }
     eg_transposed_product(p, 9, 1, first, g, state->gradient);
@@ -97,8 +127,10 @@ static inline void chain_rule(int p, eg_matches *matches, const eg_options *opti
         for (int k = 0; k < 9; ++k)
             state->diagonal[j] += first[k * p + j] * HD[k * p + j];
     }
-    if (options->exact)
+    if (options->exact) {
+        bend(p, n, chart, HD, d2F, state->bend);
         eg_product(9, 9, p, H, first, HD);
+    }
     eg_transposed_product(p, 9, p, first, HD, state->hessian);
     for (int i = 0; i < p; ++i)
         for (int j = 0; j < i; ++j) {
@@ -115,9 +147,9 @@ static void linearize(eg_matches *matches, const eg_options *options, const eg_c
                       const double *motion, eg_outcome *state)
 {
     if (chart->p == 7)
-        chain_rule(7, matches, options, chart, motion, state);
+        chain_rule(7, 7, matches, options, chart, motion, state);
     else
-        chain_rule(chart->p, matches, options, chart, motion, state);
+        chain_rule(chart->p, own_parameters(options), matches, options, chart, motion, state);
 }
 
 static double largest(const eg_outcome *state, int p)
@@ -160,33 +192,67 @@ static double decrement(const eg_outcome *state, int p)
     return 0.5 * sum;
 }
 
-/* The damped step; lambda is lifted until the damped Hessian is definite. */
-static void solve(const eg_outcome *state, int p, double lam, int scaled, double *step)
+/* The damped Hessian in units of the damping: its Cholesky factor, or eigenvectors. */
+typedef struct {
+    int factored;
+    double L[49], damped[7], vectors[49], scale[7];
+} damped_t;
+
+/* x <- -(damped Hessian)^-1 (x / scale). */
+static void apply(const damped_t *system, int p, double *x)
 {
-    double A[49], L[49], scale[7], values[7], vectors[49], x[7];
-    const double floor = DBL_EPSILON * fmax(largest(state, p), DBL_MIN);
+    double projected[7];
     for (int i = 0; i < p; ++i)
-        scale[i] = scaled ? sqrt(fmax(state->diagonal[i], floor)) : 1.0;
-    for (int i = 0; i < p; ++i) {
-        x[i] = state->gradient[i] / scale[i];
-        for (int j = 0; j < p; ++j)
-            A[i * p + j] = state->hessian[i * p + j] / (scale[i] * scale[j]);
-    }
-    if (eg_cholesky(p, A, lam, L) > WELL_CONDITIONED) {
-        eg_cholesky_solve(p, L, x);
-        for (int i = 0; i < p; ++i)
-            step[i] = -x[i] / scale[i];
+        x[i] /= -system->scale[i];
+    if (system->factored) {
+        eg_cholesky_solve(p, system->L, x);
         return;
     }
-    eg_eigen(p, A, values, vectors);
-    const double shift = values[0] + lam > 0.0 ? lam : lam - (1.0 + LIFT) * values[0];
-    double projected[7];
-    eg_transposed_product(p, p, 1, vectors, x, projected);
+    eg_transposed_product(p, p, 1, system->vectors, x, projected);
     for (int i = 0; i < p; ++i)
-        projected[i] /= fmax(values[i] + shift, DBL_MIN);
-    eg_product(p, p, 1, vectors, projected, x);
+        projected[i] /= system->damped[i];
+    eg_product(p, p, 1, system->vectors, projected, x);
+}
+
+/* The damped step, bent; lambda is lifted until the damped Hessian is definite (linear.py). */
+static void solve(const eg_outcome *state, int p, double lam, const eg_options *options,
+                  double *step)
+{
+    damped_t system;
+    double A[49], values[7];
+    const double floor = DBL_EPSILON * fmax(largest(state, p), DBL_MIN);
     for (int i = 0; i < p; ++i)
-        step[i] = -x[i] / scale[i];
+        system.scale[i] = options->scaled ? sqrt(fmax(state->diagonal[i], floor)) : 1.0;
+    for (int i = 0; i < p; ++i)
+        for (int j = 0; j < p; ++j)
+            A[i * p + j] = state->hessian[i * p + j] / (system.scale[i] * system.scale[j]);
+    system.factored = eg_cholesky(p, A, lam, system.L) > WELL_CONDITIONED;
+    if (!system.factored) {
+        eg_eigen(p, A, values, system.vectors);
+        const double shift = values[0] + lam > 0.0 ? lam : lam - (1.0 + LIFT) * values[0];
+        for (int i = 0; i < p; ++i)
+            system.damped[i] = fmax(values[i] + shift, DBL_MIN);
+    }
+    memcpy(step, state->gradient, (size_t)p * sizeof(double));
+    apply(&system, p, step);
+    double v[7], bent[7], outer[49], straight2 = 0.0, bent2 = 0.0;
+    if (options->exact) {
+        for (int i = 0; i < p; ++i)
+            v[i] = step[i] / system.scale[i];
+        eg_product(p, 1, p, v, v, outer);
+        eg_product(p, p * p, 1, state->bend, outer, bent);
+        apply(&system, p, bent);
+        for (int i = 0; i < p; ++i) {
+            bent[i] *= 0.5;
+            straight2 += step[i] * step[i];
+            bent2 += bent[i] * bent[i];
+        }
+        if (bent2 <= BENT * straight2)
+            for (int i = 0; i < p; ++i)
+                step[i] += bent[i];
+    }
+    for (int i = 0; i < p; ++i)
+        step[i] /= system.scale[i];
 }
 
 static double record(double *history, eg_outcome *outcome, double cost, double lam, double norm,
@@ -240,7 +306,7 @@ static int loop(eg_matches *matches, const eg_options *options, const eg_chart *
                 return 0;
             if (!solvable)
                 return -1;
-            solve(state, p, lam, options->scaled, step);
+            solve(state, p, lam, options, step);
             state->nit += 1;
             retract(options, chart, motion, step, moved);
             fundamental(options, chart, moved, F);

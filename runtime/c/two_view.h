@@ -20,7 +20,7 @@
 
 /* Numbers of the choices, as native.py has them. */
 enum { EG_REPROJECTION, EG_SAMPSON, EG_EPIPOLAR };
-enum { EG_ORTHO, EG_BLOCKS };
+enum { EG_ORTHO, EG_BLOCKS, EG_ESSENTIAL };
 
 typedef struct {
     int criterion, chart, loss;
@@ -57,7 +57,7 @@ static inline ptrdiff_t eg_block_size(const eg_matches *matches, ptrdiff_t begin
 /* The representation in force: some of its directions, and F in other coordinates. */
 typedef struct {
     int p;                 /* directions */
-    const double *basis;   /* (7, p), or NULL for all seven */
+    const double *basis;   /* (7, p), (5, p) of an essential matrix, or NULL for all of them */
     const double *entries; /* (9, 9) from vect(F) to vect(F) as computed with, or NULL */
 } eg_chart;
 
@@ -66,6 +66,7 @@ typedef struct {
     int current; /* whether the distances left behind are those of F */
     double cost;
     double gradient[7], hessian[49], diagonal[7];
+    double bend[343]; /* J^T r'' of the exact Hessian: linear.py */
     double normal[81]; /* J^T J by vect(F) */
     double F[9];
 } eg_outcome;

@@ -7,7 +7,7 @@ and kernels. Nothing here knows one model from another.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Kernel = Callable[..., Any]
 
-#: Lengths among the parameters are accepted between these: a wider range means a broken file, and a
+#: Focal lengths are accepted between these, in their unit: a wider range means a broken file, and a
 #: view of less than 1e-6 of a radian, where focal length and distance cannot be told apart.
 MIN_FOCAL, MAX_FOCAL = 1e-9, 1e9
 
@@ -37,7 +37,6 @@ MAX_SIZE = 1e15
 ORTHONORMAL = 1e-8
 
 _FOCAL = ("f", "fx", "fy", "c")
-_SIDES = ("width", "height")
 
 
 @dataclass(frozen=True)
@@ -50,15 +49,11 @@ class CameraModel:
         Name, and what the names of its kernels begin with.
     params, units : tuple of str
         Names of the parameters in their order, and units: ``"px"`` or ``"1"``.
-    constants : tuple of str
-        Those of them that are never refined.
     camera_size, tangent_size, point_size : int
         Numbers that a camera (12 of its pose, then the parameters), its update and a point consist
         of.
-    tangent_names, gauge_names : tuple of str
-        Names of what an update consists of, and of the directions of space that change no image.
     gauge_dimension : int
-        Number of these directions: 7 for similarities.
+        Dimension of the group of space that changes no image: 7 for similarities.
     metric : bool
         Whether a camera has a rotation and a position.
     homogeneous : bool
@@ -69,12 +64,9 @@ class CameraModel:
     prefix: str
     params: tuple[str, ...]
     units: tuple[str, ...]
-    constants: tuple[str, ...]
     camera_size: int
     tangent_size: int
     point_size: int
-    tangent_names: tuple[str, ...]
-    gauge_names: tuple[str, ...]
     gauge_dimension: int
     metric: bool
     homogeneous: bool
@@ -83,11 +75,6 @@ class CameraModel:
     def focal(self) -> tuple[int, ...]:
         """Places of the focal lengths among the parameters."""
         return tuple(k for k, name in enumerate(self.params) if name in _FOCAL)
-
-    @property
-    def positive(self) -> tuple[int, ...]:
-        """Places of the parameters that are lengths: focal lengths, and sides of images."""
-        return tuple(k for k, name in enumerate(self.params) if name in (*_FOCAL, *_SIDES))
 
     def kernel(self, name: str, backend: str | None = None) -> Kernel:
         """Return a kernel of the model, as ``project`` or ``observe``, of a backend.
@@ -108,12 +95,6 @@ class CameraModel:
         return found
 
 
-_MODELS = {
-    name: CameraModel(**{field: getattr(row, field) for field in CameraModel.__dataclass_fields__})
-    for name, row in signatures.MODELS.items()
-}
-
-
 def models() -> dict[str, CameraModel]:
     """Return all camera models by name.
 
@@ -122,7 +103,12 @@ def models() -> dict[str, CameraModel]:
     dict of str to CameraModel
         In the order of the derivation.
     """
-    return dict(_MODELS)
+    rows: Mapping[str, Any] = getattr(signatures, "MODELS", {})
+    fields = CameraModel.__dataclass_fields__
+    return {
+        name: CameraModel(**{field: getattr(row, field) for field in fields})
+        for name, row in rows.items()
+    }
 
 
 def camera_model(name: str, argument: str = "model") -> CameraModel:
@@ -145,7 +131,7 @@ def camera_model(name: str, argument: str = "model") -> CameraModel:
     ArgumentError
         If there is none of this name; the message lists those there are.
     """
-    known = _MODELS
+    known = models()
     if isinstance(name, str) and name in known:
         return known[name]
     listed = ", ".join(known)
@@ -153,39 +139,6 @@ def camera_model(name: str, argument: str = "model") -> CameraModel:
     close = difflib.get_close_matches(str(name).lower(), lower, n=1)
     hint = f" (did you mean {lower[close[0]]!r}?)" if close else ""
     raise ArgumentError(argument, f"is {name!r:.60}", f"one of {listed}{hint}")
-
-
-def check_parameters(model: str, params: ArrayLike) -> Array:
-    """Check the parameters of cameras.
-
-    Parameters
-    ----------
-    model : str
-        Name of the camera model.
-    params : array_like, shape (c, k)
-        Parameters of each camera.
-
-    Returns
-    -------
-    ndarray, shape (c, k)
-        The same; do not write into it.
-
-    Raises
-    ------
-    ArgumentError
-        As `Cameras`.
-    """
-    known = camera_model(model)
-    array = _numbers("params", params, (len(known.params),), " ".join(known.params))
-    if not len(array):
-        raise ArgumentError("params", "has no row", "a row a camera")
-    for k in known.positive:
-        bad = np.flatnonzero(~((array[:, k] >= MIN_FOCAL) & (array[:, k] <= MAX_FOCAL)))
-        if len(bad):
-            was = f"has {known.params[k]} = {array[bad[0], k]:g} in row {bad[0]}"
-            needed = f"a length between {MIN_FOCAL:g} and {MAX_FOCAL:g}"
-            raise ArgumentError("params", was, needed)
-    return array
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +172,11 @@ class Cameras:
     camera_of_view: Indices
 
     def __post_init__(self) -> None:
-        params = check_parameters(self.model, self.params)
+        model = camera_model(self.model)
+        params = _numbers("params", self.params, (len(model.params),), " ".join(model.params))
+        if not len(params):
+            raise ArgumentError("params", "has no row", "a row a camera")
+        self._check_focal(model, params)
         views = as_array("camera_of_view", self.camera_of_view, "an (n,) array")
         if views.ndim != 1 or views.dtype.kind not in "iu" or not len(views):
             was = f"is {views.dtype} {views.shape}"
@@ -232,9 +189,18 @@ class Cameras:
         if len(unused):
             was = f"names no view of camera {unused[0]}"
             raise ArgumentError("camera_of_view", was, "a view of every camera: drop other cameras")
-        object.__setattr__(self, "model", str(self.model))
+        object.__setattr__(self, "model", model.name)
         object.__setattr__(self, "params", _frozen(params))
         object.__setattr__(self, "camera_of_view", _frozen(views.astype(np.intp)))
+
+    @staticmethod
+    def _check_focal(model: CameraModel, params: Array) -> None:
+        for k in model.focal:
+            bad = np.flatnonzero(~((params[:, k] >= MIN_FOCAL) & (params[:, k] <= MAX_FOCAL)))
+            if len(bad):
+                was = f"has {model.params[k]} = {params[bad[0], k]:g} for camera {bad[0]}"
+                needed = f"a focal length between {MIN_FOCAL:g} and {MAX_FOCAL:g}"
+                raise ArgumentError("params", was, needed)
 
     @property
     def of_views(self) -> Array:
@@ -448,8 +414,7 @@ def _numbers(name: str, value: ArrayLike, shape: tuple[int, ...], what: str) -> 
     array = as_real(name, value, needed)
     if array.ndim != 1 + len(shape) or array.shape[1:] != shape:
         raise ArgumentError(name, f"has shape {array.shape}", needed)
-    entries = tuple(range(1, array.ndim))
-    bad = np.flatnonzero(~(np.abs(array) <= MAX_SIZE).all(axis=entries))
+    bad = np.flatnonzero(~(np.abs(array) <= MAX_SIZE).reshape(len(array), -1).all(axis=1))
     if len(bad):
         row = array[bad[0]]
         worst = row[~(np.abs(row) <= MAX_SIZE)][0]

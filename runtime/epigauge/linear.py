@@ -27,6 +27,11 @@ class _Solvable(Protocol):
         """Return -(H + lam W)^-1 g, with W = I or, if scaled, W = diag(J^T J)."""
 
 
+#: A correction for the bend of a valley is taken when its square is below this much of the step's:
+#: Transtrum and Sethna's bound on twice its length, 0.75.
+_BENT = 0.375**2
+
+
 @dataclass(frozen=True)
 class Levenberg:
     """Damping lambda I, called LM in B&S; the first lambda is relative to the diagonal."""
@@ -69,11 +74,20 @@ class Dense:
         Exact Hessian, or the Gauss-Newton matrix J^T J.
     diagonal : ndarray, shape (p,)
         Diagonal of J^T J, positive: the scale of each parameter.
+    bend : ndarray, shape (p, p, p), optional
+        J^T r'', with the second derivatives r'' of the residuals: lets a step follow a curved
+        valley (geodesic acceleration [1]_).
+
+    References
+    ----------
+    .. [1] M. K. Transtrum, J. P. Sethna, "Improvements to the Levenberg-Marquardt algorithm for
+       nonlinear least-squares minimization", 2012.
     """
 
     gradient: Array
     hessian: Array
     diagonal: Array
+    bend: Array | None = None
 
     def largest(self) -> float:
         """Return the largest diagonal entry of J^T J."""
@@ -84,13 +98,27 @@ class Dense:
         return self.largest()
 
     def solve(self, lam: float, *, scaled: bool) -> Array:
-        """Solve in the eigenbasis; lambda is lifted until the damped Hessian is definite."""
+        """Solve in the eigenbasis; lambda is lifted until the damped Hessian is definite.
+
+        With a bend the step v becomes v + a, where a = -(H + lambda W)^-1 J^T r''(v, v) / 2 keeps
+        the residuals to second order where v keeps them to first, unless a is long against v.
+        """
         scale, values, vectors = self._scaled if scaled else self._plain
         lowest = values[0] + lam
         shift = lam if lowest > 0.0 else lam - (1.0 + _LIFT) * values[0]
         damped = np.maximum(values + shift, np.finfo(float).tiny)
-        projected = vectors.T @ (self.gradient / scale)
-        return np.asarray(-(vectors @ (projected / damped)) / scale)
+
+        def apply(right: Array) -> Array:
+            """Return the step in units of the damping, for a gradient."""
+            return np.asarray(-(vectors @ (vectors.T @ (right / scale) / damped)))
+
+        step = apply(self.gradient)
+        if self.bend is not None:
+            v = step / scale
+            bent = 0.5 * apply((self.bend @ v) @ v)
+            if bent @ bent <= _BENT * (step @ step):
+                step = step + bent
+        return np.asarray(step / scale)
 
     def predicted(self, step: Array) -> float:
         """Return -(g^T step + step^T H step / 2)."""

@@ -118,6 +118,55 @@ def test_block_derivatives_through_the_retraction(case, M):
     assert distance(d2F, second_differences(moved, 7)) <= 1e-8
 
 
+@pytest.mark.parametrize("case", CASES)
+def test_essential_derivatives_through_the_retraction(case):
+    factors = CASES[case][:2]
+    F, dF, d2F = K.essential_derivatives(*factors)
+    P2, dP2 = K.essential_camera_derivatives(*factors)
+
+    def moved(delta):
+        return K.essential_derivatives(*K.essential_retract(*factors, delta))[0].ravel()
+
+    def moved_camera(delta):
+        return K.essential_camera_derivatives(*K.essential_retract(*factors, delta))[0].ravel()
+
+    assert distance(moved(np.zeros(5)), F.ravel()) <= 1e-15
+    assert distance(moved_camera(np.zeros(5)), P2.ravel()) <= 1e-15
+    assert_jacobian(moved, np.zeros(5), dF)
+    assert_jacobian(moved_camera, np.zeros(5), dP2)
+    assert distance(d2F, second_differences(moved, 5)) <= 1e-8
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_essential_update_keeps_r_where_t_moves_and_t_where_r_turns(case):
+    U, V = CASES[case][:2]
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    moved_t, turned = [0.0, 0.0, 0.0, 0.3, -0.2], [0.3, -0.2, 0.5, 0.0, 0.0]
+    U_new, V_new = K.essential_retract(U, V, moved_t)
+    assert distance(U_new @ quarter @ V_new.T, U @ quarter @ V.T) <= 1e-15
+    assert np.linalg.norm(U_new[:, 2] - U[:, 2]) > 0.3
+    U_new, V_new = K.essential_retract(U, V, turned)
+    assert distance(U_new, U) == 0.0
+    assert np.linalg.norm(V_new - V) > 0.3
+
+
+def test_essential_constraints_are_the_polar_form_of_a_cubic(table):
+    rng = np.random.default_rng(3)
+    A, B, C = rng.standard_normal((3, 3, 3))
+    form = table.essential_constraints
+
+    def cubic(E):
+        return np.append(2 * E @ E.T @ E - np.trace(E @ E.T) * E, np.linalg.det(E))
+
+    assert distance(form(A, A, A), cubic(A)) <= 1e-14
+    assert distance(form(A, B, C), form(C, A, B)) <= 1e-14
+    assert distance(form(2.0 * A - B, B, C), 2.0 * form(A, B, C) - form(B, B, C)) <= 1e-14
+    # Zero for [t]_x R, by another way than the factors
+    R = np.linalg.qr(A)[0]
+    E = np.cross(rng.standard_normal(3), R, axisb=0, axisc=0)
+    assert np.abs(form(E, E, E)).max() <= 1e-14 * np.linalg.norm(E) ** 3
+
+
 def test_maps_derivatives():
     parameters = np.random.default_rng(7).uniform(-1.0, 1.0, 7)
     _, dF, d2F, _, dP2 = K.maps(parameters)
@@ -487,6 +536,8 @@ def test_every_derivative_is_checked_here():
         "canonical_camera_derivatives",
         "block_derivatives",
         "block_camera_derivatives",
+        "essential_derivatives",
+        "essential_camera_derivatives",
         "project",
         "log_depth_derivatives",
         "camera_generators",
@@ -501,7 +552,7 @@ def test_every_derivative_is_checked_here():
     }
     # Names of outputs that are no derivatives.
     values = {"r", "F", "P2", "R", "U_new", "V_new", "M_new", "sigma_new", "q_hat", "depth"}
-    values |= {"R1", "R2", "s", "b1", "b2", "f", "multiplier", "last_change", "d", "e"}
+    values |= {"R1", "R2", "s", "b1", "b2", "f", "multiplier", "last_change", "c", "d", "e"}
     values |= {"moved"}
     derived = {n for n, s in SIGNATURES.items() if {a.name for a in s.outputs} - values}
     # Parts of normal equations: test_bundle.py, test_joint.py compare them with their definition.

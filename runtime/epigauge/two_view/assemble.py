@@ -16,7 +16,6 @@ from epigauge.two_view.covariance import (
     robust_inflation,
     tangent_basis,
 )
-from epigauge.two_view.essential import motion_from_essential
 from epigauge.two_view.joint import intersect
 from epigauge.two_view.minima import Search
 from epigauge.two_view.parameterizations import (
@@ -84,7 +83,7 @@ def assembled(
     jac = frame.scale * criterion.derivative(solution.F, distances) @ derivatives
     fun = frame.scale * distances.signed
     grad = jac.T @ (weight * fun)
-    E, R, t = _essential(options, F, x1_hat, x2_hat)
+    motion, E = found.motion, _essential(F, options.calibration)
     return FundamentalResult(
         F=F,
         U=factors.U,
@@ -115,8 +114,9 @@ def assembled(
         minima=found.minima,
         ambiguous=found.ambiguous,
         E=E,
-        R=R,
-        t=t,
+        R=None if motion is None else motion.R,
+        t=None if motion is None else motion.t,
+        in_front=None if motion is None else len(found.evidence.squared) - found.evidence.n_behind,
         _uncertainty=uncertainty,
         _evidence=found.evidence,
     )
@@ -145,18 +145,10 @@ def _with_frozen(factors: OrthonormalF, solution: Solution, options: Options) ->
     return OrthonormalF(U, V, factors.sigma)
 
 
-def _essential(
-    options: Options, F: Array, x1_hat: Array, x2_hat: Array
-) -> tuple[Array | None, Array | None, Array | None]:
-    """Return E and the motion of calibrated cameras, None where they are not calibrated."""
-    if options.calibration is None:
-        return None, None, None
-    K1, K2 = options.calibration
+def _essential(F: Array, calibration: tuple[Array, Array] | None) -> Array | None:
+    """Return E of unit norm, None where the cameras are not calibrated."""
+    if calibration is None:
+        return None
+    K1, K2 = calibration
     E = K2.T @ F @ K1
-    R, t = motion_from_essential(E, _rays(K1, x1_hat), _rays(K2, x2_hat))
-    return E / np.linalg.norm(E), R, t
-
-
-def _rays(K: Array, x: Array) -> Array:
-    """Return the directions (m, 3) of pixels in the camera's frame."""
-    return np.asarray(np.linalg.solve(K, np.vstack([x.T, np.ones(len(x))])).T)
+    return np.asarray(E / np.linalg.norm(E))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from epigauge.two_view.covariance import residual_noise
 from epigauge.two_view.criteria import Reprojection
+from epigauge.two_view.essential import Calibrated, Motion
 from epigauge.two_view.solve import Matches, Options, Solution
 from epigauge.verdicts import ordered
 
@@ -74,6 +75,10 @@ class Evidence:
         Standard deviation of a coordinate, from the residuals.
     parameters : int
         Number of parameters of F.
+    cameras : Calibrated or None
+        The same matches of calibrated cameras.
+    n_behind : int
+        Of calibrated cameras, the number of points behind one, by more than the noise explains.
     """
 
     F: Array
@@ -87,14 +92,20 @@ class Evidence:
     squared: Array
     noise: float
     parameters: int
+    cameras: Calibrated | None = None
+    n_behind: int = 0
 
     @cached_property
     def oriented(self) -> bool:
-        """Whether F satisfies the oriented epipolar constraint."""
+        """Whether F satisfies the oriented epipolar constraint; of E, whether none is behind."""
+        if self.cameras is not None:
+            return self.n_behind == 0
         return is_oriented(self.F, self.q1_hat, self.q2_hat, self.noise)
 
 
-def evidence(matches: Matches, options: Options, solution: Solution) -> Evidence:
+def evidence(
+    matches: Matches, options: Options, solution: Solution, motion: Motion | None = None
+) -> Evidence:
     """Collect what the diagnosis of a solution needs."""
     criterion = Reprojection(matches.table, matches.q1, matches.q2)
     feet = criterion.evaluate(solution.F)
@@ -106,6 +117,11 @@ def evidence(matches: Matches, options: Options, solution: Solution) -> Evidence
     if loss.name != "linear":
         counts &= np.sqrt(matches.weights) * np.abs(feet.signed) <= _WITHIN * noise
     to_units1, to_units2 = matches.frame.maps_from_pixels()
+    cameras, n_behind = None, 0
+    if options.calibration is not None and motion is not None:
+        cameras = matches.calibrated(options.calibration).some(counts)
+        unexplained = matches.weights * motion.excess > (_WITHIN * noise) ** 2
+        n_behind = int(np.count_nonzero(counts & unexplained))
     return Evidence(
         F=solution.F,
         q1=matches.q1[:, counts],
@@ -118,6 +134,8 @@ def evidence(matches: Matches, options: Options, solution: Solution) -> Evidence
         squared=feet.squared[counts],
         noise=noise,
         parameters=parameters,
+        cameras=cameras,
+        n_behind=n_behind,
     )
 
 
@@ -148,7 +166,10 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
       ``S_H + 2 (2 n + 8) s^2 <= S + 2 (3 n + p) s^2``; with few matches an F fits a plane better
       than its 7 parameters promise, since its epipoles are free to move among the points;
     - pure rotation: planar, and ``|tr H - tr H^-1|`` (det H = 1) within three standard deviations
-      of zero: H = K R K^-1 has the eigenvalues of a rotation whatever K;
+      of zero: H = K R K^-1 has the eigenvalues of a rotation whatever K. Of calibrated cameras,
+      planar, and the same bound holds for ``S_R / (2 n - 3)``, the rotation's;
+    - not oriented; of calibrated cameras behind the cameras: some points farther from being in
+      front of both than three standard deviations;
     - near-affine: ``S_A - S <= 11.34 s^2``;
     - weak geometry: ``deviation > 0.1``; few matches: ``n - p < 8``.
 
@@ -156,14 +177,21 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     ----------
     .. [1] K. Kanatani, "Geometric information criterion for model selection", IJCV 26(3), 1998.
     """
-    raised = {"ambiguous": ambiguous, "not oriented": not found.oriented}
+    calibrated = found.cameras is not None
+    raised = {"ambiguous": ambiguous, "not oriented": not calibrated and not found.oriented}
+    raised["behind the cameras"] = calibrated and not found.oriented
     n, p, noise2 = len(found.squared), found.parameters, max(found.noise, _ROUNDING) ** 2
     S = float(np.sum(found.weights * found.squared))
     H, squares, N_H = fit_homography(found.q1, found.q2, found.weights)
     S_H = float(found.weights @ squares)
     ratio = max(_AIC_RATIO, _variance_ratio_99(2 * n - 8, max(n - p, 4)))
     raised["planar scene"] = (2 * n - 8) * ratio * noise2 >= S_H
-    raised["pure rotation"] = raised["planar scene"] and _may_be_rotation(found, H, N_H)
+    if found.cameras is None:
+        turned = _may_be_rotation(found, H, N_H)
+    else:
+        S_R = float(found.weights @ found.cameras.from_rotation(found.weights))
+        turned = (2 * n - 3) * ratio * noise2 >= S_R
+    raised["pure rotation"] = raised["planar scene"] and turned
     raised["near-affine"] = _affine_cost(found) <= S + _AFFINE * noise2
     raised["weak geometry"] = not deviation <= _WEAK
     raised["few matches"] = n - p < _REDUNDANCY

@@ -42,7 +42,7 @@ class EliminatedProblem:
     loss : Loss or Mixture
         Applied to the squared distances.
     exact : bool
-        Exact Hessian (Newton) rather than J^T J (Gauss-Newton).
+        Exact Hessian (Newton), and steps bent like F, rather than J^T J (Gauss-Newton).
     """
 
     def __init__(
@@ -80,10 +80,12 @@ class EliminatedProblem:
         g, N, H = self.criterion.normal(state.F, state.distances, weight, curvature)
         dF, d2F = self.parameterization.derivatives(state.motion)
         normal = dF.T @ N @ dF
-        hessian = normal
-        if self.exact:
-            hessian = dF.T @ H @ dF + np.tensordot(g, d2F, axes=1)
-        return Dense(dF.T @ g, hessian, np.diag(normal).copy())
+        diagonal = np.diag(normal).copy()
+        if not self.exact:
+            return Dense(dF.T @ g, normal, diagonal)
+        hessian = dF.T @ H @ dF + np.tensordot(g, d2F, axes=1)
+        # Where the residuals hardly change, they bend as F does: r'' ~ (dr/dF) d2F
+        return Dense(dF.T @ g, hessian, diagonal, np.tensordot(dF.T @ N, d2F, axes=1))
 
     def retract(self, state: EliminatedState, step: Array) -> Any:
         """Return the estimate that a step leads to."""

@@ -17,6 +17,7 @@ from epigauge import lm
 from epigauge.two_view.covariance import residual_noise, tangent_basis
 from epigauge.two_view.criteria import Reprojection
 from epigauge.two_view.diagnostics import Evidence, evidence
+from epigauge.two_view.essential import Motion
 from epigauge.two_view.losses import Loss
 from epigauge.two_view.solve import Matches, Options, Solution, joined, minimize
 
@@ -51,7 +52,8 @@ class Minimum:
     F : ndarray, shape (3, 3)
         Fundamental matrix of unit Frobenius norm, in pixels.
     oriented : bool
-        Whether it satisfies the oriented epipolar constraint.
+        Whether it satisfies the oriented epipolar constraint; with calibrated cameras, whether all
+        points are in front of both within the noise.
     count : int
         How many starts ended in it.
     """
@@ -113,27 +115,29 @@ class Search:
     Attributes
     ----------
     solution : Solution
-        The lowest oriented minimum, or the lowest if none is oriented, with the evaluations of all
-        starts.
+        The lowest oriented minimum, or the lowest if none is oriented; with calibrated cameras the
+        lowest minimum for points in front of both. With the evaluations of all starts.
     evidence : Evidence
         What it is diagnosed from.
     minima : tuple of Minimum
         All minima by rising cost.
     ambiguous : bool
         Whether several oriented minima are within the noise of one another.
+    motion : Motion or None
+        That of calibrated cameras.
     """
 
     solution: Solution
     evidence: Evidence
     minima: tuple[Minimum, ...]
     ambiguous: bool
+    motion: Motion | None = None
 
 
 def search(
     matches: Matches,
     options: Options,
-    start: Array,
-    count: int,
+    starts: list[Array],
     callback: Callable[[lm.Row], object] | None = None,
 ) -> Search:
     """Minimise from several starts and choose among the minima.
@@ -144,10 +148,8 @@ def search(
         What is fitted.
     options : Options
         How.
-    start : ndarray, shape (3, 3)
-        Conditioned F, the first start.
-    count : int
-        Number of starts.
+    starts : list of ndarray, shape (3, 3)
+        Conditioned F.
     callback : callable, optional
         As in `epigauge.lm.minimize`, called for each start; a true value ends the whole search.
 
@@ -157,7 +159,7 @@ def search(
         Starts that end without convergence are left out, but for the first.
     """
     found: list[Solution] = []
-    for F in perturbed(matches, start, count):
+    for F in starts:
         found.append(minimize(matches, options, F, callback))
         if found[-1].outcome.status == -2:
             break
@@ -173,7 +175,11 @@ def chosen(matches: Matches, options: Options, found: list[Solution]) -> Search:
     # The lowest of each group stands for it
     groups = [sorted(group, key=_cost) for group in groups]
     groups.sort(key=lambda group: _cost(group[0]))
-    cases = [evidence(matches, options, group[0]) for group in groups]
+    motions = [_motion(matches, options, group[0]) for group in groups]
+    cases = [
+        evidence(matches, options, group[0], motion)
+        for group, motion in zip(groups, motions, strict=True)
+    ]
     minima = tuple(
         Minimum(
             cost=_cost(group[0]) * matches.frame.scale**2,
@@ -184,6 +190,8 @@ def chosen(matches: Matches, options: Options, found: list[Solution]) -> Search:
         for group, case in zip(groups, cases, strict=True)
     )
     first = next((k for k, minimum in enumerate(minima) if minimum.oriented), 0)
+    if options.calibration is not None:
+        first = int(np.argmin([motion.cost for motion in motions if motion is not None]))
     best = groups[first][0]
     noise_px = cases[first].noise * matches.frame.scale
     bound = minima[first].cost + 0.5 * AMBIGUOUS * noise_px**2
@@ -198,7 +206,27 @@ def chosen(matches: Matches, options: Options, found: list[Solution]) -> Search:
         njev=sum(solution.outcome.njev for solution in found),
         nit=sum(solution.outcome.nit for solution in found),
     )
-    return Search(replace(best, outcome=outcome), cases[first], minima, rivals > 1)
+    solution = replace(best, outcome=outcome)
+    return Search(solution, cases[first], minima, rivals > 1, motions[first])
+
+
+def _motion(matches: Matches, options: Options, solution: Solution) -> Motion | None:
+    """Return the motion of calibrated cameras, with the cost of points in front of both."""
+    if options.calibration is None:
+        return None
+    loss = options.scaled_loss(solution.loss_scale_px / matches.frame.scale)
+    reprojection = matches.reprojection()
+    feet = reprojection.evaluate(solution.F)
+    unit2: Array | float = 1.0
+    if matches.covariances is not None:  # the shortest distance to an end, in units of the noise
+        unit2 = np.max([np.linalg.eigvalsh(c)[:, -1] for c in matches.covariances], axis=0)
+    return matches.calibrated(options.calibration).motion(
+        solution.F,
+        reprojection.corrected(feet)[:2],
+        feet.squared,
+        lambda squared: 0.5 * loss(squared)[0] @ matches.weights,
+        unit2,
+    )
 
 
 def _cost(solution: Solution) -> float:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge._library import address, library
 from epigauge.two_view.conditioning import OFFSET, RMS, Conditioning
+from epigauge.two_view.essential import Essential
 from epigauge.two_view.losses import LOSSES
 from epigauge.two_view.parameterizations import (
     Block,
@@ -43,7 +44,7 @@ Array = NDArray[np.float64]
 
 #: Numbers of the choices in runtime/c/two_view.h.
 _CRITERIA = {"reprojection": 0, "sampson": 1, "epipolar": 2}
-_CHARTS = {Ortho: 0, Block: 1}
+_CHARTS = {Ortho: 0, Block: 1, Essential: 2}
 
 #: Widths of the tables that C fills: history, results and numbers of a pair.
 _ROW, _DOUBLES, _INTS = 6, 145, 5
@@ -63,7 +64,8 @@ class _Outcome(ctypes.Structure):
         *((name, ctypes.c_int) for name in ("nfev", "njev", "nit", "status", "current")),
         ("cost", ctypes.c_double),
         *((name, ctypes.c_double * n) for name, n in (("gradient", 7), ("hessian", 49))),
-        *((name, ctypes.c_double * n) for name, n in (("diagonal", 7), ("normal", 81), ("F", 9))),
+        *((name, ctypes.c_double * n) for name, n in (("diagonal", 7), ("bend", 343))),
+        *((name, ctypes.c_double * n) for name, n in (("normal", 81), ("F", 9))),
     )
 
 
@@ -91,7 +93,7 @@ def supports(criterion: str, chart: Parameterization) -> bool:
 
 
 def _parts(chart: Any) -> tuple[int, Array | None, Array | None] | None:
-    """Return kind, basis (7, p) and map of entries (9, 9) of a chart."""
+    """Return kind, basis (7 or 5, p) and map of entries (9, 9) of a chart."""
     entries = None
     if isinstance(chart, Remapped):
         entries, chart = chart.entries, chart.inner
@@ -158,7 +160,7 @@ def minimize(
     U, V, rest = motion[:9].reshape(3, 3), motion[9:18].reshape(3, 3), motion[18:]
     found = OrthonormalF(U, V, np.asarray(rest[0]))
     state = Minimum(
-        found if kind == 0 else BlockF(U, V, rest.reshape(2, 2)),
+        BlockF(U, V, rest.reshape(2, 2)) if kind == _CHARTS[Block] else found,
         np.array(outcome.F).reshape(3, 3),
         outcome.cost,
     )

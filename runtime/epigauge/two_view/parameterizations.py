@@ -102,25 +102,12 @@ class Ortho:
         "epipolar_transformation": (2, 5, 6),
     }
 
-    def __init__(self, kernels: Table, essential: bool = False) -> None:
+    def __init__(self, kernels: Table) -> None:
         self._kernels = kernels
-        self._essential = essential
-
-    @classmethod
-    def essential(cls, kernels: Table) -> Reduced:
-        """Return the five parameters of an essential matrix: sigma = 1, no null direction.
-
-        At sigma = 1 the update x3 = y3 = t leaves F as it is (B&S section 4.3).
-        """
-        basis = np.zeros((7, 5))
-        basis[[0, 1, 3, 4], [0, 1, 2, 3]] = 1.0
-        basis[[2, 5], 4] = np.sqrt(0.5), -np.sqrt(0.5)
-        return Reduced(cls(kernels, essential=True), basis)
 
     def start(self, F: Array) -> OrthonormalF:
         """Return the orthonormal representation."""
-        U, V, sigma = factorize(F)
-        return OrthonormalF(U, V, np.ones_like(sigma) if self._essential else sigma)
+        return factorize(F)
 
     def fundamental(self, estimate: OrthonormalF) -> Array:
         """Return F (B&S eq. 2)."""
@@ -341,7 +328,7 @@ class Remapped:
 
     Parameters
     ----------
-    inner : Reduced
+    inner : Parameterization
         Of F in its own coordinates.
     to1, to2 : ndarray, shape (3, 3)
         Homogeneous maps of the images from its coordinates to those computed in.
@@ -349,7 +336,9 @@ class Remapped:
         The only F to start from, in its own coordinates: parts of it stay exactly as they are.
     """
 
-    def __init__(self, inner: Reduced, to1: Array, to2: Array, anchor: Array | None = None) -> None:
+    def __init__(
+        self, inner: Parameterization, to1: Array, to2: Array, anchor: Array | None = None
+    ) -> None:
         self.inner, self._anchor = inner, anchor
         self._to1, self._to2 = to1, to2
         self._from1 = np.linalg.inv(to1)
@@ -376,6 +365,7 @@ class Remapped:
         # The unit matrix below keeps the triangle regular where directions coincide
         stacked = np.vstack([derivative / sizes, 1e-6 * np.eye(self.dimension)])
         triangle = np.linalg.qr(stacked)[1] * sizes / np.linalg.norm(f)
+        assert isinstance(self.inner, Reduced)
         inner = self.inner.recombined(np.linalg.inv(triangle))
         return Remapped(inner, self._to1, self._to2, self._anchor)
 

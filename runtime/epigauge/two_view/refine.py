@@ -29,9 +29,10 @@ from epigauge.two_view.assemble import assembled
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.criteria import CRITERIA
 from epigauge.two_view.express import express
+from epigauge.two_view.five_point import essential_starts
 from epigauge.two_view.initial import fundamental_8point
 from epigauge.two_view.losses import LOSSES
-from epigauge.two_view.minima import search
+from epigauge.two_view.minima import perturbed, search
 from epigauge.two_view.parameterizations import (
     PARAMETERIZATIONS,
     RESTRICTABLE,
@@ -43,6 +44,9 @@ from epigauge.two_view.solve import DAMPINGS, REDUNDANT, Matches, Options
 __all__ = ["refine_fundamental"]
 
 Array = NDArray[np.float64]
+
+#: Least number of starts for an essential matrix: a plane has two solutions, five matches ten.
+_ESSENTIAL_STARTS = 5
 
 
 def refine_fundamental(
@@ -82,7 +86,8 @@ def refine_fundamental(
     Parameters
     ----------
     x1, x2 : array_like, shape (m, 2)
-        At least eight matches in pixels without gross errors; also (m, 1, 2), any real type.
+        At least eight matches in pixels without gross errors, five for an essential matrix; also
+        (m, 1, 2), any real type.
     F0 : array_like, shape (3, 3), optional
         Start value with ``x2^T F0 x1 = 0``, of any scale; by default `fundamental_8point`.
     parameterization : {"ortho", "block", "maps", "parfree", "free", "normalized"}
@@ -104,7 +109,9 @@ def refine_fundamental(
         every call, ten times as large as the standard deviation of F (`minima.perturbed`); 20
         nearly always find the best minimum of near-affine scenes. Of the minima that satisfy the
         oriented epipolar constraint the lowest is returned; all are listed in ``result.minima``.
-        Evaluations and history count all starts, and `max_iter` holds for each.
+        Evaluations and history count all starts, and `max_iter` holds for each. For an essential
+        matrix the starts are solutions of subsets of five matches, at least five of them without
+        `F0`, and the minimum with the lowest cost for points in front of both cameras is returned.
     fix : str or sequence of str
         Parts of the start value to leave exactly as they are (B&S section 4.4): "epipole1",
         "epipole2", "epipolar_transformation", in the coordinates of the images. The last means
@@ -112,7 +119,7 @@ def refine_fundamental(
         leads depends slightly on the way the epipoles take.
     essential : bool
         Keep F the image of an essential matrix, sigma = 1 in calibrated coordinates: five
-        parameters. The result then has E, R and t.
+        parameters. The result then has E, R, t and in_front.
     K1, K2 : array_like, shape (3, 3), optional
         Calibration matrices for `essential`; the identity by default (coordinates on the retina),
         and K1 for both where only it is given.
@@ -184,17 +191,25 @@ def refine_fundamental(
         result = _express(x1, x2, F0, weights, plan)
         if result is not None:
             return result
-    x1, x2 = as_matches(x1, x2, general_position=True)
     options = replace(options, calibration=_calibration(essential, K1, K2))
+    least = 8 if options.calibration is None else 5
+    x1, x2 = as_matches(x1, x2, at_least=least, general_position=True)
     _check_combination(options)
     if starts > 1 and options.fix:
         raise ArgumentError("starts", f"is {starts} with fix", "1: the start holds what is fixed")
     w = np.ones(len(x1)) if weights is None else as_weights(weights, len(x1))
-    start = _start(x1, x2, w) if F0 is None else _given_start(F0, x1, x2, w)
+    if F0 is not None:
+        start: Array | None = _given_start(F0, x1, x2, w)
+    elif np.count_nonzero(w > 0.0) < least:
+        needed = f"{least} positive ones, or F0"
+        raise ArgumentError("weights", f"leave fewer than {least} matches", needed)
+    else:
+        counts = w > 0.0
+        start = fundamental_8point(x1[counts], x2[counts]) if least == 8 else None
     covariances = _covariances(covariance1, covariance2, options, starts, len(x1))
     matches = Matches.of(x1, x2, w, start, kernels.table(backend), covariances)
     options = replace(options, anchor=start if options.fix else None)
-    found = search(matches, options, matches.frame.from_pixels(start), starts, callback)
+    found = search(matches, options, _starts(matches, options, start, starts), callback)
     return assembled(found, options, matches, noise_px)
 
 
@@ -374,12 +389,19 @@ def _given_start(F0: ArrayLike, x1: Array, x2: Array, weights: Array) -> Array:
     return np.asarray(F)
 
 
-def _start(x1: Array, x2: Array, weights: Array) -> Array:
-    """Return the 8-point estimate of the matches that count."""
-    counts = weights > 0.0
-    if np.count_nonzero(counts) < 8:
-        raise ArgumentError("weights", "leave fewer than 8 matches", "8 positive ones, or F0")
-    return fundamental_8point(x1[counts], x2[counts])
+def _starts(matches: Matches, options: Options, start: Array | None, count: int) -> list[Array]:
+    """Return where to minimise from: the start, in pixels, and as many others as asked for."""
+    first = [] if start is None else [matches.frame.from_pixels(start)]
+    if options.calibration is None:
+        return perturbed(matches, first[0], count)
+    others = count - 1 if first else max(count, _ESSENTIAL_STARTS)
+    if others:
+        cameras, robust = matches.calibrated(options.calibration), options.loss != "linear"
+        first += essential_starts(cameras, matches.weights, others, robust=robust)
+    if not first:
+        needed = "matches that determine an essential matrix"
+        raise ArgumentError("x1, x2", "are in a degenerate position", needed)
+    return first
 
 
 #: Keyword options of `refine_fundamental` with their defaults, and those that a plan is made of.

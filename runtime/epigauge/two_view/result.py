@@ -86,8 +86,12 @@ class FundamentalResult(Partial):
         rival or make one up.
     E, R, t : ndarray, shape (3, 3), (3, 3), (3,), or None
         With ``essential=True``: the essential matrix of unit norm with ``E = K2^T F K1`` up to
-        scale, and the motion ``x2 = R x1 + t`` of unit length that puts most points in front of
-        both cameras.
+        scale, and the motion ``x2 = R x1 + t`` of unit length that explains the matches best by
+        points in front of both cameras.
+    in_front : int or None
+        With ``essential=True``: how many of the points that count (of positive weight; with a
+        robust loss, within three standard deviations) lie in front of both cameras, or no farther
+        from that than three standard deviations, as points nearly at infinity do.
     """
 
     F: Array
@@ -121,6 +125,7 @@ class FundamentalResult(Partial):
     E: Array | None
     R: Array | None
     t: Array | None
+    in_front: int | None
     _uncertainty: Uncertainty = field(repr=False)
     _evidence: Evidence = field(repr=False)
 

@@ -20,6 +20,7 @@ from epigauge.two_view import native
 from epigauge.two_view.conditioning import Conditioning, condition, displaced
 from epigauge.two_view.criteria import CRITERIA, Criterion, Mahalanobis, Reprojection
 from epigauge.two_view.eliminated import EliminatedProblem
+from epigauge.two_view.essential import Calibrated, Essential
 from epigauge.two_view.free import FreeProblem
 from epigauge.two_view.fused import FusedProblem
 from epigauge.two_view.joint import JointProblem
@@ -107,15 +108,21 @@ class Matches:
         x1: Array,
         x2: Array,
         weights: Array,
-        F: Array,
+        F: Array | None,
         table: Table,
         covariances: tuple[Array, Array] | None = None,
     ) -> Matches:
         """Condition matches in pixels around those that count, for a start value in pixels."""
         counts = weights > 0.0
         frame = condition(x1[counts], x2[counts])
-        frame = displaced(frame, frame.from_pixels(F))
+        if F is not None:
+            frame = displaced(frame, frame.from_pixels(F))
         return Matches(table, frame, *frame.forward(x1, x2), weights, covariances)
+
+    def calibrated(self, calibration: tuple[Array, Array]) -> Calibrated:
+        """Return the matches of cameras with these calibration matrices."""
+        maps = zip(self.frame.maps_from_pixels(), calibration, strict=True)
+        return Calibrated(self.q1, self.q2, *(to_units @ K for to_units, K in maps))
 
     def reprojection(self) -> Reprojection:
         """Return the exact criterion."""
@@ -274,8 +281,9 @@ def _chart(matches: Matches, options: Options, start: Array) -> Parameterization
     chart: Parameterization = kind(matches.table)
     to1, to2 = matches.frame.maps_from_pixels()
     if options.calibration is not None:
-        K1, K2 = options.calibration
-        return Remapped(Ortho.essential(matches.table), to1 @ K1, to2 @ K2)
+        cameras = matches.calibrated(options.calibration)
+        rays = cameras.rays(matches.q1, matches.q2)
+        return Remapped(Essential(matches.table, rays), cameras.A1, cameras.A2)
     if "epipolar_transformation" in options.fix:
         # Its coordinates are those of the pixels. Here both charts move alike; only in this one
         # sigma is a number that stays to the last bit.

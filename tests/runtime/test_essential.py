@@ -1,0 +1,228 @@
+"""Essential matrices: minima by cheirality, narrow fields of view, few matches."""
+
+from __future__ import annotations
+
+import epigauge as eg
+import numpy as np
+import pytest
+from epigauge.errors import ArgumentError
+from epigauge.two_view.essential import Calibrated, in_front
+from epigauge.two_view.five_point import essential_5point
+from two_views import Array
+
+F_TELE = 11365.0
+K_TELE = np.array([[F_TELE, 0.0, 1280.0], [0.0, F_TELE, 960.0], [0.0, 0.0, 1.0]])
+
+
+def rotation(vector: Array) -> Array:
+    """The rotation about a vector by its length."""
+    C = np.cross(np.eye(3), -np.asarray(vector))
+    angle = float(np.linalg.norm(vector))
+    return np.eye(3) + np.sinc(angle / np.pi) * C + 0.5 * np.sinc(0.5 * angle / np.pi) ** 2 * C @ C
+
+
+def pixels(K: Array, X: Array) -> Array:
+    h = X @ K.T
+    return h[:, :2] / h[:, 2:]
+
+
+def degrees(a: Array, b: Array) -> float:
+    """The angle between two directions."""
+    cosine = float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def depths(r: eg.FundamentalResult, x1: Array, x2: Array, K: Array) -> Array:
+    """Depths in both cameras by least squares, shape (m, 2): another way than that of the code."""
+    rays = [np.column_stack([x, np.ones(len(x))]) @ np.linalg.inv(K).T for x in (x1, x2)]
+    systems = np.stack([rays[0] @ r.R.T, -rays[1]], axis=2)
+    return np.stack([np.linalg.lstsq(A, -r.t)[0] for A in systems])
+
+
+def plane(seed: int, m: int = 40, slant: float = 0.0) -> tuple[Array, Array]:
+    """Matches on the retina of a plane before a camera that moves sideways, noise 1/640."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-0.5, 0.5, (m, 2))
+    X = np.column_stack([x, np.ones(m)]) / (1.0 - slant * x[:, 1:])
+    noise = rng.normal(0.0, 1.0 / 640.0, (2, m, 2))
+    return pixels(np.eye(3), X) + noise[0], pixels(
+        np.eye(3), X + np.array([0.2, 0.0, 0.0])
+    ) + noise[1]
+
+
+def tele(seed: int, t: tuple[float, ...] = (0.034, -0.0131, -0.0355)) -> tuple[Array, Array]:
+    """A narrow field of view: 68 px at a focal length of 11365, positions rounded to 0.01."""
+    g = np.arange(-2, 3) * 0.003
+    relief = np.random.default_rng(seed).uniform(-0.003, 0.003, 25)
+    X = np.column_stack([np.array(np.meshgrid(g, g)).reshape(2, -1).T, 1.0 + relief])
+    return np.round(pixels(K_TELE, X), 2), np.round(pixels(K_TELE, X + t), 2)
+
+
+class TestCheirality:
+    @pytest.mark.parametrize("slant", [0.0, 0.5])
+    @pytest.mark.parametrize("starts", [1, 20])
+    @pytest.mark.parametrize("seed", range(6))
+    def test_a_plane_leaves_one_motion_with_its_points_in_front(self, seed, starts, slant) -> None:
+        x1, x2 = plane(seed, slant=slant)
+        r = eg.refine_fundamental(x1, x2, essential=True, noise_px=None, starts=starts)
+        assert degrees(r.t, np.array([1.0, 0.0, 0.0])) <= 10.0
+        assert r.success
+        assert r.in_front == 40
+        assert (depths(r, x1, x2, np.eye(3)) > 0.0).all()
+        assert not {"behind the cameras", "not oriented", "pure rotation"} & set(r.flags)
+
+    def test_points_that_stay_behind_are_counted_and_flagged(self) -> None:
+        # From an F that a plane leaves free: into the wrong one of a plane's two motions
+        x1, x2 = plane(0)
+        F0 = eg.fundamental_8point(x1, x2)
+        r = eg.refine_fundamental(x1, x2, F0, essential=True, noise_px=None)
+        assert r.in_front < 40
+        assert "behind the cameras" in r.flags
+        assert "not oriented" not in r.flags
+        behind = (depths(r, x1, x2, np.eye(3)) < 0.0).any(axis=1)
+        assert 40 - r.in_front <= behind.sum()
+
+    def test_points_at_infinity_are_in_front_whatever_the_noise(self) -> None:
+        rng = np.random.default_rng(4)
+        X = np.column_stack([rng.uniform(-1, 1, (60, 2)), rng.uniform(2, 4, 60)])
+        X[:20] *= 1e7
+        K = np.diag([800.0, 800.0, 1.0])
+        x1, x2 = (
+            pixels(K, Y) + rng.normal(0, 0.5, (60, 2)) for Y in (X, X + np.array([0.5, 0.1, 0.2]))
+        )
+        r = eg.refine_fundamental(x1, x2, essential=True, K1=K, noise_px=None)
+        assert (depths(r, x1, x2, K) < 0.0).any()
+        assert r.in_front == 60
+        assert "behind the cameras" not in r.flags
+
+    def test_a_camera_that_only_turned_is_told_from_a_plane(self) -> None:
+        rng = np.random.default_rng(2)
+        X = np.column_stack([rng.uniform(-1, 1, (60, 2)), rng.uniform(2, 4, 60)])
+        K = np.diag([800.0, 800.0, 1.0])
+        R = rotation([0.02, 0.1, -0.05])
+        x1, x2 = (pixels(K, Y) + rng.normal(0, 0.5, (60, 2)) for Y in (X, X @ R.T))
+        r = eg.refine_fundamental(x1, x2, essential=True, K1=K, noise_px=None)
+        assert "pure rotation" in r.flags
+
+    def test_motion_is_the_cheapest_of_four(self) -> None:
+        """Every motion's cost by hand: depths by least squares, ends by a search along the ray."""
+        x1, x2 = plane(3, m=12)
+        x1, x2 = x1 + 0.05 * np.sin(40 * x2), x2  # some points end up behind
+        r = eg.refine_fundamental(x1, x2, essential=True, noise_px=None)
+        d, h1, h2 = eg.reprojection_distances(r.F, x1, x2)
+        matches = Calibrated(x1.T, x2.T, np.eye(3), np.eye(3))
+        motion = matches.motion(r.F, (h1.T, h2.T), d**2, lambda s: s.sum(axis=-1))
+        z = depths(r, h1, h2, np.eye(3))
+        np.testing.assert_allclose(motion.R, r.R, atol=1e-12)
+        np.testing.assert_array_equal(motion.excess == 0.0, (z > 0.0).all(axis=1))
+        # No point in front of both cameras is nearer to a match than `excess` says
+        far = np.geomspace(1e-3, 1e9, 4000)
+        for i in np.flatnonzero(motion.excess > 0.0):
+            rays = np.append(x1[i], 1.0) + np.random.default_rng(i).normal(0, 0.1, (60, 3)) * [
+                1,
+                1,
+                0,
+            ]
+            X = (rays[:, None] * far[None, :, None]).reshape(-1, 3)
+            Y = X @ r.R.T + r.t
+            seen = Y[:, 2] > 0.0
+            squares = np.sum((X[:, :2] / X[:, 2:] - x1[i]) ** 2, axis=1)[seen]
+            squares += np.sum((Y[seen, :2] / Y[seen, 2:] - x2[i]) ** 2, axis=1)
+            assert squares.min() >= 0.9 * (d[i] ** 2 + motion.excess[i])
+
+
+class TestNarrowFieldsOfView:
+    @pytest.mark.parametrize("t", [(0.034, -0.0131, -0.0355), (0.05, 0.0, 0.0), (0.0, 0.02, 0.03)])
+    @pytest.mark.parametrize("seed", range(5))
+    def test_converges_to_the_best(self, seed, t) -> None:
+        x1, x2 = tele(seed, t)
+        r = eg.refine_fundamental(x1, x2, essential=True, K1=K_TELE, noise_px=None)
+        best = eg.refine_fundamental(
+            x1, x2, essential=True, K1=K_TELE, noise_px=None, starts=40, max_iter=1000
+        )
+        truth = np.cross(np.asarray(t), np.eye(3), axisb=0, axisc=0)
+        inverse = np.linalg.inv(K_TELE)
+        at_truth = eg.reprojection_distances(inverse.T @ truth @ inverse, x1, x2)[0]
+        assert r.success
+        assert r.cost <= 1.05 * best.cost
+        assert r.cost <= 0.5 * np.sum(at_truth**2) + 1e-20  # the first is exact up to rounding
+        assert degrees(r.t, np.asarray(t)) <= 25.0
+        assert r.in_front == 25
+
+
+class TestFewMatches:
+    @pytest.mark.parametrize("seed", range(4))
+    @pytest.mark.parametrize("m", [5, 6, 7])
+    def test_exact_matches_give_the_motion_among_the_minima(self, m, seed) -> None:
+        rng = np.random.default_rng(seed)
+        X = np.column_stack([rng.uniform(-1, 1, (m, 2)), rng.uniform(2, 5, m)])
+        K, R, t = (
+            np.diag([900.0, 850.0, 1.0]),
+            rotation([0.1, -0.2, 0.05]),
+            np.array([1.0, 0.1, 0.2]),
+        )
+        x1, x2 = pixels(K, X), pixels(K, X @ R.T + t)
+        r = eg.refine_fundamental(x1, x2, essential=True, K1=K, starts=20)
+        inverse = np.linalg.inv(K)
+        F = inverse.T @ np.cross(t, R, axisb=0, axisc=0) @ inverse
+        F /= np.linalg.norm(F)
+        away = [min(np.linalg.norm(F - s * n.F) for s in (1, -1)) for n in r.minima if n.oriented]
+        assert min(away) <= 1e-6
+        assert r.in_front == m
+        assert "few matches" in r.flags
+        assert r.rms_px <= 1e-6
+        if m > 5:
+            assert degrees(r.t, t) <= 1e-3
+
+    def test_fewer_than_five_are_refused(self) -> None:
+        x1, x2 = plane(0, m=4)
+        with pytest.raises(ArgumentError, match="at least 5"):
+            eg.refine_fundamental(x1, x2, essential=True)
+        x1, x2 = plane(0, m=7)
+        with pytest.raises(ArgumentError, match="at least 8"):
+            eg.refine_fundamental(x1, x2)
+        with pytest.raises(ArgumentError, match="fewer than 5"):
+            eg.refine_fundamental(x1, x2, essential=True, weights=[1, 1, 1, 1, 0, 0, 0])
+
+
+class TestFivePoint:
+    def test_solutions_are_essential_and_exact_and_hold_the_truth(self) -> None:
+        rng = np.random.default_rng(1)
+        sets, truth = [], []
+        for _ in range(60):
+            R, t = rotation(rng.normal(0, 0.4, 3)), rng.standard_normal(3)
+            X = np.column_stack([rng.uniform(-2, 2, (5, 2)), rng.uniform(3, 7, 5)])
+            sets.append((X / X[:, 2:], X @ R.T + t))
+            E = np.cross(t, R, axisb=0, axisc=0)
+            truth.append(E / np.linalg.norm(E))
+        rays1, rays2 = (np.stack(rays) for rays in zip(*sets, strict=True))
+        E, origin = essential_5point(rays1, rays2)
+        values = np.linalg.svd(E, compute_uv=False)
+        np.testing.assert_allclose(values[:, 0], values[:, 1], rtol=1e-10)
+        assert values[:, 2].max() <= 1e-10
+        residual = np.einsum("nki,nij,nkj->nk", rays2[origin], E, rays1[origin])
+        assert np.abs(residual).max() <= 1e-12
+        for k, true in enumerate(truth):
+            own = E[origin == k]
+            assert len(own) % 2 == 0  # complex roots come in pairs
+            assert 2 <= len(own) <= 10
+            assert min(np.linalg.norm(own - s * true, axis=(1, 2)).min() for s in (1, -1)) <= 1e-8
+
+    def test_a_batch_is_its_sets_one_by_one(self) -> None:
+        rng = np.random.default_rng(5)
+        rays1, rays2 = rng.uniform(-1, 1, (2, 4, 5, 3)) + np.array([0.0, 0.0, 3.0])
+        E, origin = essential_5point(rays1, rays2)
+        for k in range(4):
+            own, _ = essential_5point(rays1[k : k + 1], rays2[k : k + 1])
+            np.testing.assert_allclose(np.abs(own), np.abs(E[origin == k]), atol=1e-9)
+
+
+def test_in_front_agrees_with_depths_by_least_squares() -> None:
+    rng = np.random.default_rng(8)
+    R, t = rotation([0.2, -0.1, 0.3]), np.array([0.3, -0.4, 0.2])
+    depth = rng.uniform(-4, 4, 200)
+    rays1 = np.column_stack([rng.uniform(-1, 1, (200, 2)), np.ones(200)])
+    Y = (depth[:, None] * rays1) @ R.T + t
+    expected = (depth > 0.0) & (Y[:, 2] > 0.0)
+    assert 20 < expected.sum() < 180
+    np.testing.assert_array_equal(in_front(R, t, rays1, Y / Y[:, 2:]), expected)
