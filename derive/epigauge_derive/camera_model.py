@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import sympy as sp
@@ -26,7 +26,7 @@ MEASURED = Input("q", (2,))
 Vector = Sequence[sp.Expr]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """How a camera sees space, h = M X with a 3x4 matrix M, and how it moves.
 
@@ -46,8 +46,9 @@ class Frame:
     even : callable
         Functions of delta that `act` names, without first derivative at zero: symbol to formula
         and value at zero.
-    rigid : bool
-        Whether M is a rotation and a translation.
+    relations : tuple of Expr
+        Polynomials of the entries of M that are zero; none where any matrix is a camera. With them
+        M is a rotation and a translation.
     """
 
     entries: tuple[str, ...]
@@ -56,7 +57,7 @@ class Frame:
     act: Callable[[sp.Matrix, sp.Matrix, Vector], sp.Matrix]
     seen: Callable[[sp.Matrix, sp.Matrix], sp.Matrix]
     even: Callable[[Vector], dict[sp.Symbol, tuple[sp.Expr, sp.Expr]]] = lambda delta: {}
-    rigid: bool = False
+    relations: tuple[sp.Expr, ...] = ()
 
     def moved(self, M: sp.Matrix, delta: Vector) -> sp.Matrix:
         """Return the matrix of the updated camera."""
@@ -103,16 +104,26 @@ def _carried(M: sp.Matrix, B: sp.Matrix) -> sp.Matrix:
     return M * B * inverse
 
 
+_POSE = tuple(f"R{i}{j}" if j < 3 else "t" + "xyz"[i] for i in range(3) for j in range(4))
+
+
+def _rotation() -> tuple[sp.Expr, ...]:
+    """Return what the entries of a rotation obey."""
+    R = sp.Matrix(3, 4, [sp.Symbol(name, real=True) for name in _POSE])[:, :3]
+    relations = [*(R * R.T - sp.eye(3)), *(R.T * R - sp.eye(3)), *(R.cofactor_matrix() - R)]
+    return tuple(dict.fromkeys(map(sp.expand, relations)))
+
+
 #: A pose, x_cam = R X + t. The update turns and moves the camera in its own frame about its own
 #: centre, so that a similarity of space acts on it by diag(1, s, 1) (math: equivariant update).
 POSE = Frame(
-    entries=tuple(f"R{i}{j}" if j < 3 else "t" + "xyz"[i] for i in range(3) for j in range(4)),
+    entries=_POSE,
     unknowns={"wx": "rad", "wy": "rad", "wz": "rad", "dx": "scene", "dy": "scene", "dz": "scene"},
     point_size=3,
     act=_turn,
     seen=_carried,
     even=_half_angle,
-    rigid=True,
+    relations=_rotation(),
 )
 
 
@@ -151,7 +162,6 @@ class CameraModel:
     constants: tuple[str, ...] = ()
     wrap: Callable[[Sequence[sp.Expr], Vector], Sequence[sp.Expr]] = lambda r, k: r
     aliases: tuple[str, ...] = ()
-    family: str = ""
 
     @property
     def prefix(self) -> str:
@@ -339,5 +349,5 @@ def camera_models() -> tuple[CameraModel, ...]:
         model = importlib.import_module(f"epigauge_derive.models.cameras.{name}").MODEL
         if model.prefix != name:
             raise ValueError(f"models/cameras/{name}.py: call the file {model.prefix}.py")
-        found.append(replace(model, family=f"cameras/{name}"))
+        found.append(model)
     return tuple(found)

@@ -18,7 +18,7 @@ import sympy as sp
 from epigauge_derive.kernel import Kernel, Output, at, cross
 
 if TYPE_CHECKING:
-    from epigauge_derive.camera_model import CameraModel
+    from epigauge_derive.camera_model import CameraModel, Frame
 
 # The more parameters a camera has of its own, the more cameras show what its gauge is not.
 _DIGITS, _CAMERAS = 40, 6
@@ -54,22 +54,26 @@ def generator_kernels(model: CameraModel) -> list[Kernel]:
 
 def camera_generators(model: CameraModel) -> sp.Matrix:
     """Return the update of a camera that undoes each generator of the gauge, a column each."""
+    own = _undoing(model.frame, tuple(B for _, B in gauge(model)))
+    return own.col_join(sp.zeros(len(model.adjusted), own.cols))
+
+
+@cache
+def _undoing(frame: Frame, fields: tuple[sp.ImmutableMatrix, ...]) -> sp.Matrix:
+    """Return the updates that undo fields, by projection on the fields that updates make."""
     y = sp.Matrix(sp.symbols("y0:4", real=True))
-    velocities = model.frame.velocities(y[:3, :], y)
-    # The fields that an update makes, as vectors of twelve entries.
+    velocities = frame.velocities(y[:3, :], y)
     made = sp.Matrix.hstack(
-        *(
-            sp.Matrix(12, 1, list(velocities[:, column].jacobian(y)))
-            for column in range(velocities.cols)
-        )
+        *(sp.Matrix(12, 1, list(velocities[:, i].jacobian(y))) for i in range(velocities.cols))
     )
     undo = -(made.T * made).inv() * made.T
-    columns = []
-    for _, B in gauge(model):
-        seen = model.frame.seen(model.matrix(), B)
-        own = (undo * sp.Matrix(12, 1, list(seen))).expand()
-        columns.append(own.col_join(sp.zeros(len(model.adjusted), 1)))
-    return sp.Matrix.hstack(*columns)
+    M = sp.Matrix(3, 4, [sp.Symbol(name, real=True) for name in frame.entries])
+    columns = [(undo * sp.Matrix(12, 1, list(frame.seen(M, B)))).expand() for B in fields]
+    updates = sp.Matrix.hstack(*columns)
+    if frame.relations:
+        basis = sp.groebner(frame.relations, *M, order="grevlex").exprs
+        updates = updates.applyfunc(lambda e: sp.reduced(e, basis, *M, order="grevlex")[1])
+    return updates
 
 
 @cache
@@ -111,7 +115,7 @@ def _evaluator(model: CameraModel) -> Callable[..., list[mpmath.matrix]]:
 def _place(model: CameraModel, rng: random.Random) -> list[mpmath.mpf]:
     """Return a camera in general position."""
     k = [mpmath.mpf(rng.uniform(0.4, 1.6)) for _ in model.parameters]
-    if not model.frame.rigid:
+    if not model.frame.relations:
         return [mpmath.mpf(rng.uniform(-1, 1)) for _ in range(12)] + k
     S = mpmath.matrix(3, 3)
     S[1, 0], S[2, 0], S[2, 1] = (rng.uniform(-1, 1) for _ in range(3))

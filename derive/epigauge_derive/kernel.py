@@ -202,17 +202,11 @@ def kernels() -> Iterator[Kernel]:
     from dataclasses import replace
 
     from epigauge_derive import models
-    from epigauge_derive.camera_model import camera_models
 
-    names = sorted(m.name for m in pkgutil.iter_modules(models.__path__) if not m.ispkg)
-    families = {
-        name: importlib.import_module(f"epigauge_derive.models.{name}").kernels() for name in names
-    }
-    families |= {model.family: model.kernels() for model in camera_models()}
     seen: set[str] = set()
-    for family, members in families.items():
-        for kernel in members:
+    for family in sorted(module.name for module in pkgutil.iter_modules(models.__path__)):
+        for kernel in importlib.import_module(f"epigauge_derive.models.{family}").kernels():
             if kernel.name in seen:
                 raise ValueError(f"two kernels are named {kernel.name}")
             seen.add(kernel.name)
-            yield replace(kernel, family=family)
+            yield replace(kernel, family=kernel.family or family)

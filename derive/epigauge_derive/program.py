@@ -161,10 +161,11 @@ def _check_names(program: Program) -> None:
     kernel = program.kernel
     entries = [entry for argument in kernel.inputs for entry in argument.entries()]
     computed = {symbol for statement in program.statements for symbol, _ in _blocks(statement)}
-    taken: set[str] = set()
+    # Names that C gives to arrays, to the number of observations and to the loop over them.
+    taken = {argument.name for argument in kernel.inputs if argument.shape} | {"n", "i"}
     for name in [*(entry.name for entry in entries), *sorted(symbol.name for symbol in computed)]:
         if name in taken:
-            raise ValueError(f"kernel {kernel.name}: two symbols are named {name}")
+            raise ValueError(f"kernel {kernel.name}: two symbols are named {name}, or it is taken")
         taken.add(name)
     known = {*entries, *computed}
     names = {symbol.name for symbol in known}

@@ -4,9 +4,17 @@
 #include <stddef.h>
 
 const eg_camera_model eg_camera_models[] = {
+    {"affine", 12, 8, 3, eg_affine_residual, eg_affine_observe, eg_affine_retract},
     {"bal", 15, 9, 3, eg_bal_residual, eg_bal_observe, eg_bal_retract},
+    {"brown", 23, 16, 3, eg_brown_residual, eg_brown_observe, eg_brown_retract},
+    {"full_opencv", 24, 18, 3, eg_full_opencv_residual, eg_full_opencv_observe, eg_full_opencv_retract},
+    {"opencv", 20, 14, 3, eg_opencv_residual, eg_opencv_observe, eg_opencv_retract},
+    {"opencv_fisheye", 20, 14, 3, eg_opencv_fisheye_residual, eg_opencv_fisheye_observe, eg_opencv_fisheye_retract},
     {"pinhole", 16, 10, 3, eg_pinhole_residual, eg_pinhole_observe, eg_pinhole_retract},
     {"projective", 12, 12, 4, eg_projective_residual, eg_projective_observe, eg_projective_retract},
+    {"radial", 17, 11, 3, eg_radial_residual, eg_radial_observe, eg_radial_retract},
+    {"simple_pinhole", 15, 9, 3, eg_simple_pinhole_residual, eg_simple_pinhole_observe, eg_simple_pinhole_retract},
     {"simple_radial", 16, 10, 3, eg_simple_radial_residual, eg_simple_radial_observe, eg_simple_radial_retract},
+    {"spherical", 14, 6, 3, eg_spherical_residual, eg_spherical_observe, eg_spherical_retract},
     {NULL, 0, 0, 0, NULL, NULL, NULL},
 };

@@ -4,8 +4,8 @@
 #include <math.h>
 #include <string.h>
 
-/* Formula: image of a point by the camera bal: one focal length, two coefficients of radial
-   distortion, looking along -z (BAL); depth > 0 is in front.
+/* Formula: image of a point by the camera bal: one focal length, two radial coefficients,
+   looking along -z (BAL); depth > 0 is in front.
    Inputs:  camera (15,), X (3,)
    Outputs: q_hat (2,), depth ()
    Operations: 34, temporaries: 8. */
@@ -336,7 +336,7 @@ EG_EXPORT void eg_bal_image(
    translation x, translation y, translation z, scale.
    Inputs:  camera (15,)
    Outputs: N (9, 7)
-   Operations: 180, temporaries: 19. */
+   Operations: 39, temporaries: 0. */
 EG_EXPORT void eg_bal_camera_generators(
     ptrdiff_t n,
     const double *EG_RESTRICT camera,
@@ -357,55 +357,36 @@ EG_EXPORT void eg_bal_camera_generators(
         const double R21 = camera[9*n + i];
         const double R22 = camera[10*n + i];
         const double tz = camera[11*n + i];
-        const double t0 = R11*R22;
-        const double t1 = R10*R22;
-        const double t2 = R12*R20;
-        const double t3 = R10*R21;
-        const double t4 = R01*R22;
-        const double t5 = R02*R21;
-        const double t6 = R00*R22;
-        const double t7 = R00*R21;
-        const double t8 = R01*R20;
-        const double t9 = R01*R12;
-        const double t10 = R00*R12;
-        const double t11 = R02*R10;
-        const double t12 = R00*R11;
-        const double t13 = R00*R10;
-        const double t14 = R20*tz;
-        const double t15 = R01*R11;
-        const double t16 = R21*tz;
-        const double t17 = R02*R12;
-        const double t18 = R22*tz;
-        N[i] = R12*R21 - t0;
-        N[n + i] = t1 - t2;
-        N[2*n + i] = R11*R20 - t3;
-        N[7*n + i] = t4 - t5;
-        N[8*n + i] = R02*R20 - t6;
-        N[9*n + i] = t7 - t8;
-        N[14*n + i] = R02*R11 - t9;
-        N[15*n + i] = t10 - t11;
-        N[16*n + i] = R01*R10 - t12;
-        N[21*n + i] = t4*tz + t9*ty - t5*tz - R02*R11*ty;
-        N[22*n + i] = R02*R10*ty + R02*R20*tz - t10*ty - t6*tz;
-        N[23*n + i] = t12*ty + t7*tz - t8*tz - R01*R10*ty;
+        N[i] = -R00;
+        N[n + i] = -R01;
+        N[2*n + i] = -R02;
+        N[7*n + i] = -R10;
+        N[8*n + i] = -R11;
+        N[9*n + i] = -R12;
+        N[14*n + i] = -R20;
+        N[15*n + i] = -R21;
+        N[16*n + i] = -R22;
+        N[21*n + i] = R20*ty - R10*tz;
+        N[22*n + i] = R21*ty - R11*tz;
+        N[23*n + i] = R22*ty - R12*tz;
         N[24*n + i] = R00;
         N[25*n + i] = R01;
         N[26*n + i] = R02;
-        N[27*n + i] = -R00*t14 - R00*R00*tx - R01*t16 - R01*R01*tx - R02*t18 - R02*R02*tx - t13*ty - t15*ty - t17*ty;
-        N[28*n + i] = R02*R11*tx + R11*R22*tz - t9*tx - R12*R21*tz;
-        N[29*n + i] = t10*tx + t2*tz - t1*tz - t11*tx;
-        N[30*n + i] = R01*R10*tx + R10*R21*tz - t12*tx - R11*R20*tz;
+        N[27*n + i] = -tx;
+        N[28*n + i] = R00*tz - R20*tx;
+        N[29*n + i] = R01*tz - R21*tx;
+        N[30*n + i] = R02*tz - R22*tx;
         N[31*n + i] = R10;
         N[32*n + i] = R11;
         N[33*n + i] = R12;
-        N[34*n + i] = -R10*t14 - R10*R10*ty - R11*t16 - R11*R11*ty - R12*t18 - R12*R12*ty - t13*tx - t15*tx - t17*tx;
-        N[35*n + i] = R02*R21*tx + R12*R21*ty - t0*ty - t4*tx;
-        N[36*n + i] = t1*ty + t6*tx - t2*ty - R02*R20*tx;
-        N[37*n + i] = R01*R20*tx + R11*R20*ty - t3*ty - t7*tx;
+        N[34*n + i] = -ty;
+        N[35*n + i] = R10*tx - R00*ty;
+        N[36*n + i] = R11*tx - R01*ty;
+        N[37*n + i] = R12*tx - R02*ty;
         N[38*n + i] = R20;
         N[39*n + i] = R21;
         N[40*n + i] = R22;
-        N[41*n + i] = -R20*R20*tz - R21*R21*tz - R22*R22*tz - R00*R20*tx - R01*R21*tx - R02*R22*tx - R10*R20*ty - R11*R21*ty - R12*R22*ty;
+        N[41*n + i] = -tz;
     }
 }
 

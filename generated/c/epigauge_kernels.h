@@ -162,6 +162,556 @@ EG_EXPORT void eg_two_view_structure(
     double *EG_RESTRICT J_S,
     double *EG_RESTRICT J_P2);
 
+EG_EXPORT void eg_affine_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_affine_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_affine_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_affine_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_affine_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_affine_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_affine_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_bal_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_bal_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_bal_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_bal_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_bal_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    const double *EG_RESTRICT intrinsics,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_bal_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_bal_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_brown_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_brown_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_brown_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_brown_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_brown_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    const double *EG_RESTRICT intrinsics,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_brown_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_brown_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_full_opencv_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_full_opencv_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_full_opencv_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_full_opencv_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_full_opencv_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    const double *EG_RESTRICT intrinsics,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_full_opencv_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_full_opencv_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_opencv_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_opencv_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_opencv_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_opencv_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_opencv_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    const double *EG_RESTRICT intrinsics,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_opencv_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_opencv_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_opencv_fisheye_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_opencv_fisheye_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_opencv_fisheye_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_opencv_fisheye_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_opencv_fisheye_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    const double *EG_RESTRICT intrinsics,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_opencv_fisheye_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_opencv_fisheye_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_pinhole_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_pinhole_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_pinhole_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_pinhole_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_pinhole_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    const double *EG_RESTRICT intrinsics,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_pinhole_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_pinhole_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_projective_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_projective_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_projective_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_projective_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_projective_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_projective_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_projective_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_radial_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_radial_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_radial_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_radial_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_radial_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    const double *EG_RESTRICT intrinsics,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_radial_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_radial_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_simple_pinhole_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_simple_pinhole_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_simple_pinhole_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_simple_pinhole_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_simple_pinhole_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    const double *EG_RESTRICT intrinsics,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_simple_pinhole_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_simple_pinhole_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_simple_radial_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_simple_radial_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_simple_radial_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_simple_radial_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_simple_radial_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    const double *EG_RESTRICT intrinsics,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_simple_radial_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_simple_radial_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_spherical_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_spherical_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_spherical_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_spherical_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_spherical_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    const double *EG_RESTRICT intrinsics,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_spherical_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_spherical_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
 EG_EXPORT void eg_fundamental_of_coordinates(
     ptrdiff_t n,
     const double *EG_RESTRICT F,
@@ -690,189 +1240,6 @@ EG_EXPORT void eg_rotation_derivatives(
     const double *EG_RESTRICT U,
     double *EG_RESTRICT dU,
     double *EG_RESTRICT d2U);
-
-EG_EXPORT void eg_bal_project(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT X,
-    double *EG_RESTRICT q_hat,
-    double *EG_RESTRICT depth);
-
-EG_EXPORT void eg_bal_residual(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT X,
-    const double *EG_RESTRICT q,
-    double *EG_RESTRICT r);
-
-EG_EXPORT void eg_bal_observe(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT X,
-    const double *EG_RESTRICT q,
-    double *EG_RESTRICT r,
-    double *EG_RESTRICT J_camera,
-    double *EG_RESTRICT J_point);
-
-EG_EXPORT void eg_bal_retract(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT delta,
-    double *EG_RESTRICT moved);
-
-EG_EXPORT void eg_bal_image(
-    ptrdiff_t n,
-    const double *EG_RESTRICT h,
-    const double *EG_RESTRICT intrinsics,
-    double *EG_RESTRICT q_hat,
-    double *EG_RESTRICT a);
-
-EG_EXPORT void eg_bal_camera_generators(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    double *EG_RESTRICT N);
-
-EG_EXPORT void eg_bal_point_generators(
-    ptrdiff_t n,
-    const double *EG_RESTRICT X,
-    double *EG_RESTRICT N);
-
-EG_EXPORT void eg_pinhole_project(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT X,
-    double *EG_RESTRICT q_hat,
-    double *EG_RESTRICT depth);
-
-EG_EXPORT void eg_pinhole_residual(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT X,
-    const double *EG_RESTRICT q,
-    double *EG_RESTRICT r);
-
-EG_EXPORT void eg_pinhole_observe(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT X,
-    const double *EG_RESTRICT q,
-    double *EG_RESTRICT r,
-    double *EG_RESTRICT J_camera,
-    double *EG_RESTRICT J_point);
-
-EG_EXPORT void eg_pinhole_retract(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT delta,
-    double *EG_RESTRICT moved);
-
-EG_EXPORT void eg_pinhole_image(
-    ptrdiff_t n,
-    const double *EG_RESTRICT h,
-    const double *EG_RESTRICT intrinsics,
-    double *EG_RESTRICT q_hat,
-    double *EG_RESTRICT a);
-
-EG_EXPORT void eg_pinhole_camera_generators(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    double *EG_RESTRICT N);
-
-EG_EXPORT void eg_pinhole_point_generators(
-    ptrdiff_t n,
-    const double *EG_RESTRICT X,
-    double *EG_RESTRICT N);
-
-EG_EXPORT void eg_projective_project(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT X,
-    double *EG_RESTRICT q_hat,
-    double *EG_RESTRICT depth);
-
-EG_EXPORT void eg_projective_residual(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT X,
-    const double *EG_RESTRICT q,
-    double *EG_RESTRICT r);
-
-EG_EXPORT void eg_projective_observe(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT X,
-    const double *EG_RESTRICT q,
-    double *EG_RESTRICT r,
-    double *EG_RESTRICT J_camera,
-    double *EG_RESTRICT J_point);
-
-EG_EXPORT void eg_projective_retract(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT delta,
-    double *EG_RESTRICT moved);
-
-EG_EXPORT void eg_projective_image(
-    ptrdiff_t n,
-    const double *EG_RESTRICT h,
-    double *EG_RESTRICT q_hat,
-    double *EG_RESTRICT a);
-
-EG_EXPORT void eg_projective_camera_generators(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    double *EG_RESTRICT N);
-
-EG_EXPORT void eg_projective_point_generators(
-    ptrdiff_t n,
-    const double *EG_RESTRICT X,
-    double *EG_RESTRICT N);
-
-EG_EXPORT void eg_simple_radial_project(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT X,
-    double *EG_RESTRICT q_hat,
-    double *EG_RESTRICT depth);
-
-EG_EXPORT void eg_simple_radial_residual(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT X,
-    const double *EG_RESTRICT q,
-    double *EG_RESTRICT r);
-
-EG_EXPORT void eg_simple_radial_observe(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT X,
-    const double *EG_RESTRICT q,
-    double *EG_RESTRICT r,
-    double *EG_RESTRICT J_camera,
-    double *EG_RESTRICT J_point);
-
-EG_EXPORT void eg_simple_radial_retract(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    const double *EG_RESTRICT delta,
-    double *EG_RESTRICT moved);
-
-EG_EXPORT void eg_simple_radial_image(
-    ptrdiff_t n,
-    const double *EG_RESTRICT h,
-    const double *EG_RESTRICT intrinsics,
-    double *EG_RESTRICT q_hat,
-    double *EG_RESTRICT a);
-
-EG_EXPORT void eg_simple_radial_camera_generators(
-    ptrdiff_t n,
-    const double *EG_RESTRICT camera,
-    double *EG_RESTRICT N);
-
-EG_EXPORT void eg_simple_radial_point_generators(
-    ptrdiff_t n,
-    const double *EG_RESTRICT X,
-    double *EG_RESTRICT N);
 
 /* A camera model: sizes of camera, update and point, and its kernels. */
 typedef struct {

@@ -17,7 +17,7 @@ import sympy as sp
 from epigauge_derive import kernel as registry
 from epigauge_derive import models
 from epigauge_derive.emitters import numpy as numpy_emitter
-from epigauge_derive.kernel import Input, Kernel, Let, Loop, Output, select
+from epigauge_derive.kernel import Input, Kernel, Let, Loop, Output, floor, select
 from epigauge_derive.printer import Printer
 from epigauge_derive.program import compile_kernel
 
@@ -66,7 +66,6 @@ def run(kernel, *inputs):
         X ** sp.Rational(2, 3),
         2**X,
         sp.I * X,
-        sp.pi * X,
         sp.oo,
         sp.nan,
         sp.zoo,
@@ -280,11 +279,28 @@ def test_temporaries_never_take_the_name_of_an_input():
     assert run(kernel, [1.0, 2.0, 5.0]) == pytest.approx(expected, rel=1e-14)
 
 
-def test_input_with_ambiguous_entry_names_is_an_error():
-    with pytest.raises(ValueError, match="ambiguous"):
-        Input("A", (11, 11)).entries()
+def test_entries_of_an_input_have_names_of_their_own():
+    for shape in [(11, 11), (2, 12), (30,), (3, 4), (7, 11, 3)]:
+        names = [entry.name for entry in Input("A", shape).entries()]
+        assert len(set(names)) == len(names) == math.prod(shape)
+    assert [e.name for e in Input("A", (11,)).entries()][:2] == ["A_0", "A_1"]
+    assert [e.name for e in Input("k", (2,), names=("f", "k1")).entries()] == ["f", "k1"]
+    with pytest.raises(ValueError, match="1 names"):
+        Input("k", (2,), names=("f",)).entries()
     # A digit at the end of the name is set off from the index.
     assert [e.name for e in Input("P2", (2,)).entries()] == ["P2_0", "P2_1"]
+
+
+@pytest.mark.parametrize("name", ["n", "i", "k", "x"])
+def test_entry_with_a_name_that_is_taken_is_an_error(name):
+    inputs = (Input("k", (1,), names=(name,)), Input("x"))
+    with pytest.raises(ValueError, match=f"named {name}, or it is taken"):
+        compile_kernel(toy(X, inputs=inputs))
+
+
+def test_pi_and_whole_numbers_below_are_printed():
+    (value,) = run(toy(sp.pi * floor(X / sp.pi)), 7.0, 0.0)
+    assert value == math.pi * 2.0
 
 
 @pytest.fixture

@@ -49,7 +49,7 @@ def scene(model, rng, n=1, m=1, behind=False):
         else:
             R = orthonormal(rng)
             t = rng.uniform(-0.5, 0.5, 3)
-            t[2] += facing(model) * (-3.0 if behind else 3.0)
+            t[2] += facing(model) * (-2.2 if behind else 2.2)
             M = np.column_stack([R, t])
         cameras.append(np.concatenate([M.ravel(), parameters(model, rng)]))
     return np.stack(cameras, axis=1), X
@@ -79,7 +79,7 @@ def test_jacobians_are_differences_through_the_update(table, name, behind):
             lambda X, camera=camera: call(model, "project", camera, X, table=table)[0], X, J_point
         )
         q_hat, _ = call(model, "project", camera, X, table=table)
-        assert distance(r, call(model, "residual", camera, X, q, table=table)) == 0.0
+        assert distance(r, call(model, "residual", camera, X, q, table=table)) <= 1e-15
         if name != "spherical":
             assert distance(r, q - q_hat) <= 1e-15
 
@@ -121,7 +121,7 @@ def test_generators_are_the_null_space_of_many_views(name):
     scales = (n + m if model.homogeneous else 0)
     values = np.linalg.svd(J / np.linalg.norm(J, axis=0), compute_uv=False)
     free = model.gauge_dimension + scales
-    assert values[-free] <= 1e-13 < 1e-9 < values[-free - 1]
+    assert values[-free] <= 1e-14 < 1e-11 < values[-free - 1]
 
 
 def similarity(rng):

@@ -113,7 +113,7 @@ def _model(model: CameraModel) -> str:
         "tangent_units": tuple(model.unknowns.values()),
         "gauge_dimension": len(generators),
         "gauge_names": tuple(generators),
-        "metric": model.frame.rigid,
+        "metric": bool(model.frame.relations),
         "homogeneous": model.frame.point_size == 4,
     }
     text = ""

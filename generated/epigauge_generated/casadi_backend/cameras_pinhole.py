@@ -312,7 +312,7 @@ def pinhole_camera_generators():
     # translation x, translation y, translation z, scale.
     # Inputs:  camera (16,)
     # Outputs: N (10, 7)
-    # Operations: 180, temporaries: 19.
+    # Operations: 39, temporaries: 0.
     camera = ca.SX.sym("camera", 16, 1)
     R00 = camera[0, 0]
     R01 = camera[1, 0]
@@ -326,56 +326,37 @@ def pinhole_camera_generators():
     R21 = camera[9, 0]
     R22 = camera[10, 0]
     tz = camera[11, 0]
-    t0 = R11*R22
-    t1 = R10*R22
-    t2 = R12*R20
-    t3 = R10*R21
-    t4 = R01*R22
-    t5 = R02*R21
-    t6 = R00*R22
-    t7 = R00*R21
-    t8 = R01*R20
-    t9 = R01*R12
-    t10 = R00*R12
-    t11 = R02*R10
-    t12 = R00*R11
-    t13 = R00*R10
-    t14 = R20*tz
-    t15 = R01*R11
-    t16 = R21*tz
-    t17 = R02*R12
-    t18 = R22*tz
     N = ca.SX(10, 7)
-    N[0, 0] = R12*R21 - t0
-    N[0, 1] = t1 - t2
-    N[0, 2] = R11*R20 - t3
-    N[1, 0] = t4 - t5
-    N[1, 1] = R02*R20 - t6
-    N[1, 2] = t7 - t8
-    N[2, 0] = R02*R11 - t9
-    N[2, 1] = t10 - t11
-    N[2, 2] = R01*R10 - t12
-    N[3, 0] = t4*tz + t9*ty - t5*tz - R02*R11*ty
-    N[3, 1] = R02*R10*ty + R02*R20*tz - t10*ty - t6*tz
-    N[3, 2] = t12*ty + t7*tz - t8*tz - R01*R10*ty
+    N[0, 0] = -R00
+    N[0, 1] = -R01
+    N[0, 2] = -R02
+    N[1, 0] = -R10
+    N[1, 1] = -R11
+    N[1, 2] = -R12
+    N[2, 0] = -R20
+    N[2, 1] = -R21
+    N[2, 2] = -R22
+    N[3, 0] = R20*ty - R10*tz
+    N[3, 1] = R21*ty - R11*tz
+    N[3, 2] = R22*ty - R12*tz
     N[3, 3] = R00
     N[3, 4] = R01
     N[3, 5] = R02
-    N[3, 6] = -R00*t14 - R00*R00*tx - R01*t16 - R01*R01*tx - R02*t18 - R02*R02*tx - t13*ty - t15*ty - t17*ty
-    N[4, 0] = R02*R11*tx + R11*R22*tz - t9*tx - R12*R21*tz
-    N[4, 1] = t10*tx + t2*tz - t1*tz - t11*tx
-    N[4, 2] = R01*R10*tx + R10*R21*tz - t12*tx - R11*R20*tz
+    N[3, 6] = -tx
+    N[4, 0] = R00*tz - R20*tx
+    N[4, 1] = R01*tz - R21*tx
+    N[4, 2] = R02*tz - R22*tx
     N[4, 3] = R10
     N[4, 4] = R11
     N[4, 5] = R12
-    N[4, 6] = -R10*t14 - R10*R10*ty - R11*t16 - R11*R11*ty - R12*t18 - R12*R12*ty - t13*tx - t15*tx - t17*tx
-    N[5, 0] = R02*R21*tx + R12*R21*ty - t0*ty - t4*tx
-    N[5, 1] = t1*ty + t6*tx - t2*ty - R02*R20*tx
-    N[5, 2] = R01*R20*tx + R11*R20*ty - t3*ty - t7*tx
+    N[4, 6] = -ty
+    N[5, 0] = R10*tx - R00*ty
+    N[5, 1] = R11*tx - R01*ty
+    N[5, 2] = R12*tx - R02*ty
     N[5, 3] = R20
     N[5, 4] = R21
     N[5, 5] = R22
-    N[5, 6] = -R20*R20*tz - R21*R21*tz - R22*R22*tz - R00*R20*tx - R01*R21*tx - R02*R22*tx - R10*R20*ty - R11*R21*ty - R12*R22*ty
+    N[5, 6] = -tz
     return ca.Function(
         "pinhole_camera_generators",
         [camera],

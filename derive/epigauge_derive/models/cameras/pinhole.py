@@ -5,12 +5,14 @@ from __future__ import annotations
 import sympy as sp
 
 from epigauge_derive.camera_model import CameraModel, Vector
+from epigauge_derive.lenses import direction
 
 
 def image(h: sp.Matrix, k: Vector) -> list[sp.Expr]:
     """Return the image point."""
     fx, fy, cx, cy = k
-    return [fx * h[0] / h[2] + cx, fy * h[1] / h[2] + cy]
+    u, v = direction(h)
+    return [fx * u + cx, fy * v + cy]
 
 
 MODEL = CameraModel(

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sympy as sp
 
-from epigauge_derive.camera_model import CameraModel, Frame
+from epigauge_derive.camera_model import CameraModel, Frame, Vector
+from epigauge_derive.lenses import direction
 
 ENTRIES = tuple(f"P{i}{j}" for i in range(3) for j in range(4))
 
 
-def act(h: sp.Matrix, X: sp.Matrix, delta: list[sp.Expr]) -> sp.Matrix:
+def act(h: sp.Matrix, X: sp.Matrix, delta: Vector) -> sp.Matrix:
     """Return (P + D) X, with D = delta row by row."""
     return h + sp.Matrix(3, 4, delta) * X
 
@@ -18,7 +19,7 @@ MODEL = CameraModel(
     name="projective",
     title="q_hat ~ P Q (B03 section 3)",
     parameters={},
-    image=lambda h, k: [h[0] / h[2], h[1] / h[2]],
+    image=lambda h, k: list(direction(h)),
     frame=Frame(
         entries=ENTRIES,
         unknowns=dict.fromkeys((f"d{name}" for name in ENTRIES), "1"),

@@ -5,13 +5,14 @@ from __future__ import annotations
 import sympy as sp
 
 from epigauge_derive.camera_model import CameraModel, Vector
+from epigauge_derive.lenses import direction, polynomial
 
 
 def image(h: sp.Matrix, k: Vector) -> list[sp.Expr]:
     """Return the image point."""
     f, cx, cy, k1 = k
-    u, v = h[0] / h[2], h[1] / h[2]
-    scale = f * (1 + k1 * (u**2 + v**2))
+    u, v = direction(h)
+    scale = f * polynomial(u**2 + v**2, [k1])
     return [scale * u + cx, scale * v + cy]
 
 

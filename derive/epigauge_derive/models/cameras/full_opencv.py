@@ -1,0 +1,39 @@
+"""Rational radial and tangential distortion, OpenCV's model of eight coefficients."""
+
+from __future__ import annotations
+
+import sympy as sp
+
+from epigauge_derive.camera_model import CameraModel, Vector
+from epigauge_derive.lenses import direction, polynomial, tangential
+
+
+def image(h: sp.Matrix, k: Vector) -> list[sp.Expr]:
+    """Return the image point."""
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6 = k
+    u, v = direction(h)
+    squared = u**2 + v**2
+    scale = polynomial(squared, [k1, k2, k3]) / polynomial(squared, [k4, k5, k6])
+    shift = tangential(u, v, p1, p2)
+    return [fx * (scale * u + shift[0]) + cx, fy * (scale * v + shift[1]) + cy]
+
+
+MODEL = CameraModel(
+    name="FULL_OPENCV",
+    title="rational radial distortion and two tangential coefficients (COLMAP, OpenCV)",
+    parameters={
+        "fx": "px",
+        "fy": "px",
+        "cx": "px",
+        "cy": "px",
+        "k1": "1",
+        "k2": "1",
+        "p1": "1",
+        "p2": "1",
+        "k3": "1",
+        "k4": "1",
+        "k5": "1",
+        "k6": "1",
+    },
+    image=image,
+)
