@@ -14,6 +14,7 @@
 /* As in lm.py and linear.py. */
 #define LAM_CEILING 1e16
 #define LAM_FACTOR 10.0
+#define LAM_FLOOR 1e-11
 #define LAM_START 1e-3
 #define LIFT 1e-3
 #define BENT (0.375 * 0.375)
@@ -289,6 +290,7 @@ static int loop(eg_matches *matches, const eg_options *options, const eg_chart *
     if (!isfinite(state->cost))
         return -3;
     double lam = options->scaled ? LAM_START : LAM_START * fmax(largest(state, p), TINIEST);
+    const double least = LAM_FLOOR * lam;
     for (;;) {
         double step[7], moved[EG_MOTION] = {0.0}, F[9], trial, decrease, steepest = 0.0, norm = 0.0;
         for (int i = 0; i < p; ++i)
@@ -326,7 +328,7 @@ static int loop(eg_matches *matches, const eg_options *options, const eg_chart *
             if (lam > ceiling)
                 return -1;
         }
-        lam /= LAM_FACTOR;
+        lam = fmax(lam / LAM_FACTOR, least);
         state->cost = trial;
         memcpy(motion, moved, sizeof moved);
         memcpy(state->F, F, sizeof F);

@@ -9,9 +9,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Arrow", "Dense", "Levenberg", "Seber"]
+__all__ = ["LAM_FLOOR", "Arrow", "Dense", "Levenberg", "Seber"]
 
 Array = NDArray[np.float64]
+
+#: Least lambda over the first in two views, whose small systems are solved to rounding: lower than
+#: that of many views, since essential matrices in a narrow field of view have directions that are
+#: determined 1e6 times worse than others.
+LAM_FLOOR = 1e-11
 
 #: A direction of negative curvature is lifted this far above zero, relative to the curvature.
 _LIFT = 1e-3

@@ -52,6 +52,10 @@ STATUS = {
 
 _LAM_CEILING = 1e16
 
+#: Least lambda over the first. Below, rounding decides on steps along directions that a flat scene
+#: hardly determines: other ones in every basis. Nothing is gained there: no run takes more steps.
+_LAM_FLOOR = 1e-8
+
 #: Most trial steps: the compiled loop keeps a row for each.
 _MAX_ITER = 1_000_000
 
@@ -244,6 +248,7 @@ def minimize(
     stopping: Stopping,
     callback: Callable[[Row], object] | None = None,
     scale: float = 1.0,
+    lam_floor: float = _LAM_FLOOR,
 ) -> Outcome[S]:
     """Minimise a cost by damped steps.
 
@@ -263,6 +268,8 @@ def minimize(
         Called with each `Row`; a true return value stops the minimisation.
     scale : float
         Factor from the problem's cost to the unit that the history is told in.
+    lam_floor : float
+        Least lambda, over the first one.
 
     Returns
     -------
@@ -295,6 +302,7 @@ def minimize(
     system = problem.linearize(state)
     njev += 1
     lam = damping.start(system)
+    least = lam_floor * lam
 
     def outcome(status: int) -> Outcome[S]:
         counts = (len(history), njev, iteration)
@@ -341,7 +349,7 @@ def minimize(
             if too_large(lam):
                 return outcome(-1)
         predicted = system.predicted(step)
-        lam = schedule.accepted(lam, decrease / predicted if predicted > 0.0 else 1.0)
+        lam = max(schedule.accepted(lam, decrease / predicted if predicted > 0.0 else 1.0), least)
         state = trial
         system = problem.linearize(state)
         njev += 1

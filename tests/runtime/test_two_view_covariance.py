@@ -175,7 +175,7 @@ class TestNoise:
 
 def uncertainty_of(F: Array, N: Array) -> Uncertainty:
     """What a normal matrix (9, 9) says about F in coordinates that are pixels."""
-    return fundamental_covariance(F, N, 1.0, (np.eye(3), np.eye(3)), tangent_basis(F))
+    return fundamental_covariance(F, N, N, (np.eye(3), np.eye(3)), tangent_basis(F))
 
 
 def rotation_matrix(angles: Array) -> Array:

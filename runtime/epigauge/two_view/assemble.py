@@ -11,9 +11,9 @@ from epigauge import lm
 from epigauge.two_view.bias import bias_corrected
 from epigauge.two_view.covariance import (
     fundamental_covariance,
+    influence,
     residual_noise,
     restricted_basis,
-    robust_inflation,
     tangent_basis,
 )
 from epigauge.two_view.joint import intersect
@@ -68,15 +68,15 @@ def assembled(
     if noise_px is None:
         noise = found.evidence.noise if matches.covariances is None else residual
         noise_px = noise * frame.scale
-    kappa = robust_inflation(distances.signed, weights, loss, chart.dimension, residual)
+    a, b = influence(distances.signed, weights, loss, chart.dimension, residual)
     # Derivatives are by F of the norm it has inside; those by F of unit norm are so much larger.
     norm = float(np.linalg.norm(solution.F))
     unit = solution.F / norm
     restricted = chart.dimension < 7
     uncertainty = fundamental_covariance(
         unit,
-        norm**2 * (feet_by_entries * weights) @ feet_by_entries.T,
-        kappa * (noise_px / frame.scale) ** 2,
+        norm**2 * (feet_by_entries * a) @ feet_by_entries.T,
+        norm**2 * (noise_px / frame.scale) ** 2 * (feet_by_entries * b) @ feet_by_entries.T,
         frame.maps_from_pixels(),
         restricted_basis(unit, derivatives) if restricted else tangent_basis(unit),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,13 +14,20 @@ from epigauge.two_view.losses import Loss, robust_scale
 __all__ = [
     "Uncertainty",
     "fundamental_covariance",
+    "influence",
     "residual_noise",
     "restricted_basis",
-    "robust_inflation",
     "tangent_basis",
+    "truncated_deviation",
 ]
 
 Array = NDArray[np.float64]
+
+#: Standard deviations within which a match is taken for a right one.
+_CUT = 2.5
+
+#: Least mean slope of the influence of right matches.
+_LEAST = 1e-3
 
 #: Where Gaussian errors are sampled, in standard deviations.
 _NODES = np.linspace(-5.0, 5.0, 31)
@@ -194,7 +202,11 @@ def restricted_basis(F: Array, derivative: Array) -> Array:
 
 
 def fundamental_covariance(
-    F: Array, N: Array, variance: float, to_units: tuple[Array, Array], basis: Array
+    F: Array,
+    A: Array,
+    B: Array,
+    to_units: tuple[Array, Array],
+    basis: Array,
 ) -> Uncertainty:
     """Propagate the noise of the matches to F.
 
@@ -202,10 +214,11 @@ def fundamental_covariance(
     ----------
     F : ndarray, shape (3, 3)
         Conditioned estimate with unit Frobenius norm.
-    N : ndarray, shape (9, 9)
-        J^T J, with the weights of the matches, by vect(F), conditioned.
-    variance : float
-        Variance of a conditioned coordinate of a match of weight one.
+    A : ndarray, shape (9, 9)
+        Expected Hessian by vect(F), conditioned: J^T J with the weights of the matches, for least
+        squares.
+    B : ndarray, shape (9, 9)
+        Covariance of the gradient: for least squares A times the variance of a match of weight one.
     to_units : pair of ndarray, shape (3, 3)
         Maps of the images from pixels to conditioned coordinates.
     basis : ndarray, shape (9, k)
@@ -214,15 +227,17 @@ def fundamental_covariance(
     Returns
     -------
     Uncertainty
-        The covariance ``variance * basis (basis^T N basis)^-1 basis^T``.
+        The covariance ``A^-1 B A^-1`` in the basis.
     """
-    values, vectors = np.linalg.eigh(basis.T @ N @ basis)
+    values, vectors = np.linalg.eigh(basis.T @ A @ basis)
     determined = values > 1e-14 * max(values[-1], np.finfo(float).tiny)
     directions = basis @ vectors
     complete = bool(determined.all())
+    known = directions[:, determined] / np.sqrt(values[determined])
+    spread, turned = np.linalg.eigh(known.T @ B @ known)
     return Uncertainty(
         F=F,
-        root=directions[:, determined] * np.sqrt(variance / values[determined]),
+        root=known @ turned * np.sqrt(np.maximum(spread, 0.0)),
         undetermined=directions[:, ~determined],
         to_units1=to_units[0],
         to_units2=to_units[1],
@@ -249,25 +264,39 @@ def residual_noise(d: Array, weights: Array, loss: Loss, parameters: int) -> flo
     -------
     float
         ``sqrt(sum(w d^2) / (m - parameters))``; with a robust loss over the matches within 2.5
-        times `robust_scale` only, m being their number.
+        times `robust_scale` only, m being their number, and divided by the 0.955 that this leaves
+        of a normal deviation.
     """
     counts = weights > 0.0
     standardized = (np.sqrt(weights) * d)[counts]
+    consistency = 1.0
     if loss.name != "linear":
-        standardized = standardized[np.abs(standardized) <= 2.5 * robust_scale(standardized)]
-    return float(np.sqrt(np.sum(standardized**2) / max(len(standardized) - parameters, 1)))
+        standardized = standardized[np.abs(standardized) <= _CUT * robust_scale(standardized)]
+        consistency = truncated_deviation(_CUT)
+    variance = float(np.sum(standardized**2)) / max(len(standardized) - parameters, 1)
+    return float(np.sqrt(variance)) / consistency
 
 
-def robust_inflation(d: Array, weights: Array, loss: Loss, parameters: int, noise: float) -> float:
-    """Return how much larger variances are with a robust loss than with clean least squares.
+def truncated_deviation(limit: float) -> float:
+    """Return the standard deviation of a standard normal variable within +-limit."""
+    inside = math.erf(limit / math.sqrt(2.0))
+    return math.sqrt(max(1.0 - 2.0 * limit * _density(limit) / inside, 0.0))
 
-    The variance of an M-estimate is ``kappa noise^2 (J^T W J)^-1`` with
 
-        kappa = [sum(w psi^2) / (m - parameters)] / [noise mean(psi')]^2,
+def _density(x: float) -> float:
+    return math.exp(-0.5 * x * x) / math.sqrt(2.0 * math.pi)
 
-    psi(d) = rho'(d^2) d the influence of a residual, and both means over the matches that count
-    [1]_. Down-weighting matches by rho' alone, ``(J^T W rho' J)^-1``, would be too large for clean
-    data.
+
+def influence(
+    d: Array, weights: Array, loss: Loss, parameters: int, noise: float
+) -> tuple[Array, Array]:
+    """Return what each match adds to the Hessian and to the covariance of the gradient.
+
+    An M-estimate has the covariance ``A^-1 B A^-1`` [1]_ with ``A = sum(a J^T J)`` and
+    ``B = noise^2 sum(b J^T J)``. With the influence psi(d) = rho'(d^2) d of a residual, a = w psi'
+    and b = (w psi / noise)^2. Matches within 2.5 standard deviations are taken for right ones, with
+    one distribution: they share the means of psi' and psi^2, which are well determined. The others
+    count one by one: where wrong matches are, and how far off, is not random.
 
     Parameters
     ----------
@@ -278,20 +307,34 @@ def robust_inflation(d: Array, weights: Array, loss: Loss, parameters: int, nois
 
     Returns
     -------
-    float
-        kappa; one for the linear loss, infinity where no match has any influence.
+    a, b : ndarray, shape (m,)
+        Both the weights for the linear loss, and for residuals that are all zero.
+
+    Notes
+    -----
+    By simulation (120 matches, 0 to 30 % wrong, 5 or 60 px off), the mean of the squared error of F
+    in units of this covariance is 1.0 to 1.2 times what it should be; 1.2 to 1.5 with 30 % far off,
+    where one factor for all matches would leave 2.5; and up to 1.4 with the loss "truncated".
+
+    The loss "truncated" is not smooth: psi falls from c to 0 at its scale c, and psi' has a peak
+    there, -2 c times the normal density in all.
 
     References
     ----------
-    .. [1] P. J. Huber, "Robust Statistics", 1981, section 7.6.
+    .. [1] P. J. Huber, "Robust Statistics", 1981, section 6.3.
     """
-    if loss.name == "linear":
-        return 1.0
-    counts = weights > 0.0
-    d, weights = d[counts], weights[counts]
+    if loss.name == "linear" or noise == 0.0:
+        return weights, weights
     _, first, second = loss(d**2)
-    slope = float(np.mean(first + 2.0 * second * d**2))
-    power = float(np.sum(weights * (first * d) ** 2)) / max(len(d) - parameters, 1)
-    if noise == 0.0:
-        return 1.0
-    return power / (noise * slope) ** 2 if slope > 0.0 else float("inf")
+    slope, power = first + 2.0 * second * d**2, weights * (first * d / noise) ** 2
+    right = (weights > 0.0) & (np.sqrt(weights) * np.abs(d) <= _CUT * noise)
+    count = int(np.count_nonzero(right))
+    if count:
+        slope = np.where(right, np.mean(slope[right]), slope)
+        power = np.where(right, np.mean(power[right]), power)
+    if loss.name == "truncated":
+        jump = loss.scale / noise
+        peak = 2.0 * jump * _density(jump) / math.erf(_CUT / math.sqrt(2.0))
+        slope = np.where(right, np.maximum(slope - peak, _LEAST), slope)
+    redundancy = count / max(count - parameters, 1)
+    return weights * np.maximum(slope, 0.0), weights * power * redundancy

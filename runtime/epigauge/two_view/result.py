@@ -40,8 +40,8 @@ class FundamentalResult(Partial):
         Covariance of vect(F) to first order, of rank 7, or 5 for an essential matrix, or fewer by
         the parameters fixed; its diagonal is infinite where the matches do not determine F. It is
         ``noise_px^2 (J^T W J)^-1`` with the weights W, which are taken for inverse variances in
-        units of 1 / noise_px^2, times the factor of an M-estimate with a robust loss
-        (`epigauge.two_view.covariance.robust_inflation`). J is that of the reprojection error
+        units of 1 / noise_px^2; with a robust loss it is that of an M-estimate, ``A^-1 B A^-1``
+        (`epigauge.two_view.covariance.influence`). J is that of the reprojection error
         whatever the criterion, whose minimum has the same covariance to first order.
     rank : int
         Number of free directions of F that the matches determine: 7 if nothing is held fixed.
