@@ -216,6 +216,7 @@ class CameraModel:
             self._project(),
             self._residual(),
             self.observe(),
+            self._sight(),
             self._retract(),
             self._image_alone(),
             *generator_kernels(self),
@@ -257,6 +258,17 @@ class CameraModel:
                 Output.of("J_camera", turned.row_join(b)),
                 Output.of("J_point", a * self.matrix()[:, : self.point_size]),
             ),
+            (*self._seen(), slopes),
+        )
+
+    def _sight(self) -> Kernel:
+        slopes, a, _ = self._slopes()
+        return Kernel(
+            f"{self.prefix}_sight",
+            f"r = q - q_hat of a point in the camera {self.name}, and the Jacobian of the image by "
+            "the point.",
+            (*self.inputs(), MEASURED),
+            (self._difference(), Output.of("J_point", a * self.matrix()[:, : self.point_size])),
             (*self._seen(), slopes),
         )
 

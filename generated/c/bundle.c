@@ -965,3 +965,44 @@ EG_EXPORT void eg_point_step(
         promised[i] = y0*y0 + y1*y1 + y2*y2 + y3*y3;
     }
 }
+
+/* Formula: upper triangular T with T T^T = N^-1 for a 3x3 matrix, from its upper triangle.
+   Inputs:  N (6,)
+   Outputs: T (3, 3)
+   Operations: 31, temporaries: 12. */
+EG_EXPORT void eg_inverse_root3(
+    ptrdiff_t n,
+    const double *EG_RESTRICT N,
+    double *EG_RESTRICT T)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double N0 = N[i];
+        const double N1 = N[n + i];
+        const double N2 = N[2*n + i];
+        const double N3 = N[3*n + i];
+        const double N4 = N[4*n + i];
+        const double N5 = N[5*n + i];
+        const double L00 = sqrt(N0);
+        const double L_inverse00 = 1.0/L00;
+        const double L10 = L_inverse00*N1;
+        const double L11 = sqrt(N3 - L10*L10);
+        const double L_inverse11 = 1.0/L11;
+        const double L_inverse10 = -L10*L_inverse00*L_inverse11;
+        const double L20 = L_inverse00*N2;
+        const double L21 = L_inverse11*(N4 - L10*L20);
+        const double L22 = sqrt(N5 - L20*L20 - L21*L21);
+        const double L_inverse22 = 1.0/L22;
+        const double L_inverse20 = -L_inverse22*(L20*L_inverse00 + L21*L_inverse10);
+        const double L_inverse21 = -L21*L_inverse11*L_inverse22;
+        T[i] = L_inverse00;
+        T[n + i] = L_inverse10;
+        T[2*n + i] = L_inverse20;
+        T[3*n + i] = 0.0;
+        T[4*n + i] = L_inverse11;
+        T[5*n + i] = L_inverse21;
+        T[6*n + i] = 0.0;
+        T[7*n + i] = 0.0;
+        T[8*n + i] = L_inverse22;
+    }
+}

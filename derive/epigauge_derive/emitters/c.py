@@ -95,6 +95,13 @@ typedef struct {
         double *EG_RESTRICT r,
         double *EG_RESTRICT J_camera,
         double *EG_RESTRICT J_point);
+    void (*sight)(
+        ptrdiff_t n,
+        const double *EG_RESTRICT camera,
+        const double *EG_RESTRICT X,
+        const double *EG_RESTRICT q,
+        double *EG_RESTRICT r,
+        double *EG_RESTRICT J_point);
     void (*retract)(
         ptrdiff_t n,
         const double *EG_RESTRICT camera,
@@ -133,7 +140,8 @@ def _table(models: Sequence[CameraModel]) -> str:
     rows = []
     for model in models:
         sizes = [model.camera_size, model.tangent_size, model.point_size]
-        functions = [f"eg_{model.prefix}_{name}" for name in ("residual", "observe", "retract")]
+        names = ("residual", "observe", "sight", "retract")
+        functions = [f"eg_{model.prefix}_{name}" for name in names]
         entries = [quoted(model.prefix), *map(str, sizes), *functions]
         rows.append(f"    {{{', '.join(entries)}}},\n")
     return (
@@ -141,7 +149,7 @@ def _table(models: Sequence[CameraModel]) -> str:
         + '#include "epigauge_kernels.h"\n\n#include <stddef.h>\n\n'
         + "const eg_camera_model eg_camera_models[] = {\n"
         + "".join(rows)
-        + "    {NULL, 0, 0, 0, NULL, NULL, NULL},\n};\n"
+        + "    {NULL, 0, 0, 0, NULL, NULL, NULL, NULL},\n};\n"
     )
 
 

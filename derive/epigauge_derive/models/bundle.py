@@ -29,6 +29,7 @@ T = Input("T", (4, 4))
 _SQUARINGS, _SHIFT = 8, 1e-13
 
 N, W, G, LAM = Input("N", (10,)), Input("W", (10,)), Input("g", (4,)), Input("lam")
+N3 = Input("N", (6,))
 
 
 def kernels() -> list[Kernel]:
@@ -157,20 +158,22 @@ def _least_eigenvector() -> Kernel:
 
 
 def _symmetric(entries: list[sp.Symbol]) -> sp.Matrix:
-    """Unpack an upper triangle of four rows."""
-    index = {}
-    for i in range(4):
-        for j in range(i, 4):
+    """Unpack an upper triangle of three or four rows."""
+    index: dict[tuple[int, int], int] = {}
+    size = 3 if len(entries) == 6 else 4
+    for i in range(size):
+        for j in range(i, size):
             index[i, j] = index[j, i] = len(set(index.values()))
-    return sp.Matrix(4, 4, lambda i, j: entries[index[i, j]])
+    return sp.Matrix(size, size, lambda i, j: entries[index[i, j]])
 
 
 def _cholesky(name: str, matrix: sp.Matrix, values: dict[sp.Symbol, sp.Expr]) -> sp.Matrix:
     """Define the factor L, A = L L^T, and return L^-1; both by symbols, entry by entry."""
-    L, inverse = sp.zeros(4, 4), sp.zeros(4, 4)
+    size = matrix.rows
+    L, inverse = sp.zeros(size, size), sp.zeros(size, size)
     reciprocal = []
-    for j in range(4):
-        for i in range(j, 4):
+    for j in range(size):
+        for i in range(j, size):
             rest = matrix[i, j] - sum(L[i, k] * L[j, k] for k in range(j))
             symbol = sp.Symbol(f"{name}{i}{j}", real=True)
             values[symbol] = sp.sqrt(rest) if i == j else rest * reciprocal[j]
@@ -178,9 +181,9 @@ def _cholesky(name: str, matrix: sp.Matrix, values: dict[sp.Symbol, sp.Expr]) ->
             if i == j:
                 reciprocal.append(sp.Symbol(f"{name}_inverse{i}{i}", real=True))
                 values[reciprocal[j]] = 1 / symbol
-    for j in range(4):
+    for j in range(size):
         inverse[j, j] = reciprocal[j]
-        for i in range(j + 1, 4):
+        for i in range(j + 1, size):
             symbol = sp.Symbol(f"{name}_inverse{i}{j}", real=True)
             values[symbol] = -reciprocal[i] * sum(L[i, k] * inverse[k, j] for k in range(j, i))
             inverse[i, j] = symbol
@@ -236,4 +239,18 @@ def _point() -> list[Kernel]:
             ),
             (Let(own),),
         ),
+        _euclidean(),
     ]
+
+
+def _euclidean() -> Kernel:
+    """Return the same root for points of three coordinates."""
+    plain: dict[sp.Symbol, sp.Expr] = {}
+    root = _cholesky("L", _symmetric(N3.entries()), plain).T
+    return Kernel(
+        "inverse_root3",
+        "upper triangular T with T T^T = N^-1 for a 3x3 matrix, from its upper triangle.",
+        (N3,),
+        (Output.of("T", root),),
+        (Let(plain),),
+    )

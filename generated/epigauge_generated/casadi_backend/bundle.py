@@ -719,3 +719,44 @@ def point_step():
         ["N", "W", "g", "lam"],
         ["step", "promised"],
     )
+
+
+@cache
+def inverse_root3():
+    # Formula: upper triangular T with T T^T = N^-1 for a 3x3 matrix, from its upper triangle.
+    # Inputs:  N (6,)
+    # Outputs: T (3, 3)
+    # Operations: 31, temporaries: 12.
+    N = ca.SX.sym("N", 6, 1)
+    N0 = N[0, 0]
+    N1 = N[1, 0]
+    N2 = N[2, 0]
+    N3 = N[3, 0]
+    N4 = N[4, 0]
+    N5 = N[5, 0]
+    L00 = ca.sqrt(N0)
+    L_inverse00 = 1.0/L00
+    L10 = L_inverse00*N1
+    L11 = ca.sqrt(N3 - L10*L10)
+    L_inverse11 = 1.0/L11
+    L_inverse10 = -L10*L_inverse00*L_inverse11
+    L20 = L_inverse00*N2
+    L21 = L_inverse11*(N4 - L10*L20)
+    L22 = ca.sqrt(N5 - L20*L20 - L21*L21)
+    L_inverse22 = 1.0/L22
+    L_inverse20 = -L_inverse22*(L20*L_inverse00 + L21*L_inverse10)
+    L_inverse21 = -L21*L_inverse11*L_inverse22
+    T = ca.SX(3, 3)
+    T[0, 0] = L_inverse00
+    T[0, 1] = L_inverse10
+    T[0, 2] = L_inverse20
+    T[1, 1] = L_inverse11
+    T[1, 2] = L_inverse21
+    T[2, 2] = L_inverse22
+    return ca.Function(
+        "inverse_root3",
+        [N],
+        [T],
+        ["N"],
+        ["T"],
+    )

@@ -616,3 +616,37 @@ def point_step(N, W, g, lam, step, promised):
     step[2] = -L_inverse22*y2 - L_inverse32*y3
     step[3] = -L_inverse33*y3
     promised[...] = y0*y0 + y1*y1 + y2*y2 + y3*y3
+
+
+def inverse_root3(N, T):
+    # Formula: upper triangular T with T T^T = N^-1 for a 3x3 matrix, from its upper triangle.
+    # Inputs:  N (6,)
+    # Outputs: T (3, 3)
+    # Operations: 31, temporaries: 12.
+    N0 = N[0]
+    N1 = N[1]
+    N2 = N[2]
+    N3 = N[3]
+    N4 = N[4]
+    N5 = N[5]
+    L00 = np.sqrt(N0)
+    L_inverse00 = 1.0/L00
+    L10 = L_inverse00*N1
+    L11 = np.sqrt(N3 - L10*L10)
+    L_inverse11 = 1.0/L11
+    L_inverse10 = -L10*L_inverse00*L_inverse11
+    L20 = L_inverse00*N2
+    L21 = L_inverse11*(N4 - L10*L20)
+    L22 = np.sqrt(N5 - L20*L20 - L21*L21)
+    L_inverse22 = 1.0/L22
+    L_inverse20 = -L_inverse22*(L20*L_inverse00 + L21*L_inverse10)
+    L_inverse21 = -L21*L_inverse11*L_inverse22
+    T[0, 0] = L_inverse00
+    T[0, 1] = L_inverse10
+    T[0, 2] = L_inverse20
+    T[1, 0] = 0.0
+    T[1, 1] = L_inverse11
+    T[1, 2] = L_inverse21
+    T[2, 0] = 0.0
+    T[2, 1] = 0.0
+    T[2, 2] = L_inverse22

@@ -141,6 +141,50 @@ def projective_observe(camera, X, q, r, J_camera, J_point):
     J_point[1, 3] = P13*inverse_depth + P23*a12
 
 
+def projective_sight(camera, X, q, r, J_point):
+    # Formula: r = q - q_hat of a point in the camera projective, and the Jacobian of the image
+    # by the point.
+    # Inputs:  camera (12,), X (4,), q (2,)
+    # Outputs: r (2,), J_point (2, 4)
+    # Operations: 54, temporaries: 8.
+    P00 = camera[0]
+    P01 = camera[1]
+    P02 = camera[2]
+    P03 = camera[3]
+    P10 = camera[4]
+    P11 = camera[5]
+    P12 = camera[6]
+    P13 = camera[7]
+    P20 = camera[8]
+    P21 = camera[9]
+    P22 = camera[10]
+    P23 = camera[11]
+    X0 = X[0]
+    X1 = X[1]
+    X2 = X[2]
+    X3 = X[3]
+    q0 = q[0]
+    q1 = q[1]
+    h0 = P00*X0 + P01*X1 + P02*X2 + P03*X3
+    h2 = P20*X0 + P21*X1 + P22*X2 + P23*X3
+    inverse_depth = 1.0/h2
+    u = h0*inverse_depth
+    h1 = P10*X0 + P11*X1 + P12*X2 + P13*X3
+    v = h1*inverse_depth
+    a02 = -inverse_depth*u
+    a12 = -inverse_depth*v
+    r[0] = q0 - u
+    r[1] = q1 - v
+    J_point[0, 0] = P00*inverse_depth + P20*a02
+    J_point[0, 1] = P01*inverse_depth + P21*a02
+    J_point[0, 2] = P02*inverse_depth + P22*a02
+    J_point[0, 3] = P03*inverse_depth + P23*a02
+    J_point[1, 0] = P10*inverse_depth + P20*a12
+    J_point[1, 1] = P11*inverse_depth + P21*a12
+    J_point[1, 2] = P12*inverse_depth + P22*a12
+    J_point[1, 3] = P13*inverse_depth + P23*a12
+
+
 def projective_retract(camera, delta, moved):
     # Formula: projective camera moved by an update (dP00, dP01, dP02, dP03, dP10, dP11, dP12,
     # dP13, dP20, dP21, dP22, dP23).
