@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from epigauge.multi_view import _native
+from epigauge import _native
 
 
 @contextmanager

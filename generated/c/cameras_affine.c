@@ -143,6 +143,52 @@ EG_EXPORT void eg_affine_observe(
     }
 }
 
+/* Formula: r = q - q_hat of a point in the camera affine, and the Jacobian of the image by
+   the point.
+   Inputs:  camera (12,), X (3,), q (2,)
+   Outputs: r (2,), J_point (2, 3)
+   Operations: 20, temporaries: 3. */
+EG_EXPORT void eg_affine_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double P00 = camera[i];
+        const double P01 = camera[n + i];
+        const double P02 = camera[2*n + i];
+        const double P03 = camera[3*n + i];
+        const double P10 = camera[4*n + i];
+        const double P11 = camera[5*n + i];
+        const double P12 = camera[6*n + i];
+        const double P13 = camera[7*n + i];
+        const double P20 = camera[8*n + i];
+        const double P21 = camera[9*n + i];
+        const double P22 = camera[10*n + i];
+        const double P23 = camera[11*n + i];
+        const double X0 = X[i];
+        const double X1 = X[n + i];
+        const double X2 = X[2*n + i];
+        const double q0 = q[i];
+        const double q1 = q[n + i];
+        const double h0 = P03 + P00*X0 + P01*X1 + P02*X2;
+        const double h1 = P13 + P10*X0 + P11*X1 + P12*X2;
+        const double h2 = P23 + P20*X0 + P21*X1 + P22*X2;
+        r[i] = q0 - h0;
+        r[n + i] = q1 - h1;
+        J_point[i] = P00;
+        J_point[n + i] = P01;
+        J_point[2*n + i] = P02;
+        J_point[3*n + i] = P10;
+        J_point[4*n + i] = P11;
+        J_point[5*n + i] = P12;
+    }
+}
+
 /* Formula: affine camera moved by an update (dP00, dP01, dP02, dP03, dP10, dP11, dP12, dP13).
    Inputs:  camera (12,), delta (8,)
    Outputs: moved (12,)

@@ -193,6 +193,82 @@ EG_EXPORT void eg_bal_observe(
     }
 }
 
+/* Formula: r = q - q_hat of a point in the camera bal, and the Jacobian of the image by the
+   point.
+   Inputs:  camera (15,), X (3,), q (2,)
+   Outputs: r (2,), J_point (2, 3)
+   Operations: 95, temporaries: 30. */
+EG_EXPORT void eg_bal_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double R00 = camera[i];
+        const double R01 = camera[n + i];
+        const double R02 = camera[2*n + i];
+        const double tx = camera[3*n + i];
+        const double R10 = camera[4*n + i];
+        const double R11 = camera[5*n + i];
+        const double R12 = camera[6*n + i];
+        const double ty = camera[7*n + i];
+        const double R20 = camera[8*n + i];
+        const double R21 = camera[9*n + i];
+        const double R22 = camera[10*n + i];
+        const double tz = camera[11*n + i];
+        const double f = camera[12*n + i];
+        const double k1 = camera[13*n + i];
+        const double k2 = camera[14*n + i];
+        const double X0 = X[i];
+        const double X1 = X[n + i];
+        const double X2 = X[2*n + i];
+        const double q0 = q[i];
+        const double q1 = q[n + i];
+        const double h0 = tx + R00*X0 + R01*X1 + R02*X2;
+        const double h2 = tz + R20*X0 + R21*X1 + R22*X2;
+        const double inverse_depth = 1.0/h2;
+        const double u = h0*inverse_depth;
+        const double h1 = ty + R10*X0 + R11*X1 + R12*X2;
+        const double v = h1*inverse_depth;
+        const double t0 = u*u + v*v;
+        const double t1 = k2*t0;
+        const double t2 = k1 + t1;
+        const double t3 = f*(1.0 + t0*t2);
+        const double t4 = 2.0*t1;
+        const double t5 = 2.0*t2;
+        const double t6 = t4*u + t5*u;
+        const double t7 = f*u;
+        const double b00 = -t3 - t6*t7;
+        const double t10 = b00*inverse_depth;
+        const double a00 = t10;
+        const double t8 = t4*v + t5*v;
+        const double b01 = -t7*t8;
+        const double t11 = b01*inverse_depth;
+        const double a01 = t11;
+        const double a02 = -t10*u - t11*v;
+        const double t9 = f*v;
+        const double b10 = -t6*t9;
+        const double t12 = b10*inverse_depth;
+        const double a10 = t12;
+        const double b11 = -t3 - t8*t9;
+        const double t13 = b11*inverse_depth;
+        const double a11 = t13;
+        const double a12 = -t12*u - t13*v;
+        r[i] = q0 + t3*u;
+        r[n + i] = q1 + t3*v;
+        J_point[i] = R00*a00 + R10*a01 + R20*a02;
+        J_point[n + i] = R01*a00 + R11*a01 + R21*a02;
+        J_point[2*n + i] = R02*a00 + R12*a01 + R22*a02;
+        J_point[3*n + i] = R00*a10 + R10*a11 + R20*a12;
+        J_point[4*n + i] = R01*a10 + R11*a11 + R21*a12;
+        J_point[5*n + i] = R02*a10 + R12*a11 + R22*a12;
+    }
+}
+
 /* Formula: bal camera moved by an update (wx, wy, wz, dx, dy, dz, f, k1, k2).
    Inputs:  camera (15,), delta (9,)
    Outputs: moved (15,)

@@ -270,6 +270,102 @@ EG_EXPORT void eg_brown_observe(
     }
 }
 
+/* Formula: r = q - q_hat of a point in the camera brown, and the Jacobian of the image by the
+   point.
+   Inputs:  camera (23,), X (3,), q (2,)
+   Outputs: r (2,), J_point (2, 3)
+   Operations: 159, temporaries: 42. */
+EG_EXPORT void eg_brown_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double R00 = camera[i];
+        const double R01 = camera[n + i];
+        const double R02 = camera[2*n + i];
+        const double tx = camera[3*n + i];
+        const double R10 = camera[4*n + i];
+        const double R11 = camera[5*n + i];
+        const double R12 = camera[6*n + i];
+        const double ty = camera[7*n + i];
+        const double R20 = camera[8*n + i];
+        const double R21 = camera[9*n + i];
+        const double R22 = camera[10*n + i];
+        const double tz = camera[11*n + i];
+        const double c = camera[12*n + i];
+        const double x0 = camera[13*n + i];
+        const double y0 = camera[14*n + i];
+        const double A1 = camera[15*n + i];
+        const double A2 = camera[16*n + i];
+        const double A3 = camera[17*n + i];
+        const double B1 = camera[18*n + i];
+        const double B2 = camera[19*n + i];
+        const double C1 = camera[20*n + i];
+        const double C2 = camera[21*n + i];
+        const double R0 = camera[22*n + i];
+        const double X0 = X[i];
+        const double X1 = X[n + i];
+        const double X2 = X[2*n + i];
+        const double q0 = q[i];
+        const double q1 = q[n + i];
+        const double t0 = C1*c;
+        const double t1 = c*c;
+        const double h0 = tx + R00*X0 + R01*X1 + R02*X2;
+        const double h2 = tz + R20*X0 + R21*X1 + R22*X2;
+        const double inverse_depth = 1.0/h2;
+        const double u = h0*inverse_depth;
+        const double t4 = t1*u*u;
+        const double h1 = ty + R10*X0 + R11*X1 + R12*X2;
+        const double v = h1*inverse_depth;
+        const double t5 = t1*v*v;
+        const double t6 = t4 + t5;
+        const double t9 = t6*t6;
+        const double t13 = 1.0 + A1*(t6 - R0*R0) + A2*(t9 - R0*R0*R0*R0) + A3*(t6*t6*t6 - R0*R0*R0*R0*R0*R0);
+        const double t14 = c*t13;
+        const double t15 = C2*c;
+        const double t2 = 2.0*t1;
+        const double t18 = t2*v;
+        const double t21 = B1*u;
+        const double t10 = A3*t9;
+        const double t3 = A1*t2;
+        const double t7 = 4.0*A2*t1*t6;
+        const double t8 = 6.0*t1;
+        const double t11 = t3*u + t7*u + t10*t8*u;
+        const double t12 = c*u;
+        const double b00 = 6.0*B1*t1*u + 2.0*B2*t1*v - t0 - t14 - t11*t12;
+        const double t22 = b00*inverse_depth;
+        const double a00 = t22;
+        const double t16 = t8*v;
+        const double t17 = t10*t16 + t3*v + t7*v;
+        const double t19 = B1*t18 + B2*t2*u;
+        const double b01 = t19 - t15 - t12*t17;
+        const double t23 = b01*inverse_depth;
+        const double a01 = t23;
+        const double a02 = -t22*u - t23*v;
+        const double t20 = c*v;
+        const double b10 = t19 - t11*t20;
+        const double t24 = b10*inverse_depth;
+        const double a10 = t24;
+        const double b11 = B2*t16 + t2*t21 - t14 - t17*t20;
+        const double t25 = b11*inverse_depth;
+        const double a11 = t25;
+        const double a12 = -t24*u - t25*v;
+        r[i] = q0 + t0*u + t14*u + t15*v - x0 - B1*(3.0*t4 + t5) - B2*t18*u;
+        r[n + i] = q1 + c*t13*v - y0 - B2*(t4 + 3.0*t5) - t18*t21;
+        J_point[i] = R00*a00 + R10*a01 + R20*a02;
+        J_point[n + i] = R01*a00 + R11*a01 + R21*a02;
+        J_point[2*n + i] = R02*a00 + R12*a01 + R22*a02;
+        J_point[3*n + i] = R00*a10 + R10*a11 + R20*a12;
+        J_point[4*n + i] = R01*a10 + R11*a11 + R21*a12;
+        J_point[5*n + i] = R02*a10 + R12*a11 + R22*a12;
+    }
+}
+
 /* Formula: brown camera moved by an update (wx, wy, wz, dx, dy, dz, c, x0, y0, A1, A2, A3,
    B1, B2, C1, C2).
    Inputs:  camera (23,), delta (16,)

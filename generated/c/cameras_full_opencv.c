@@ -273,6 +273,109 @@ EG_EXPORT void eg_full_opencv_observe(
     }
 }
 
+/* Formula: r = q - q_hat of a point in the camera FULL_OPENCV, and the Jacobian of the image
+   by the point.
+   Inputs:  camera (24,), X (3,), q (2,)
+   Outputs: r (2,), J_point (2, 3)
+   Operations: 168, temporaries: 48. */
+EG_EXPORT void eg_full_opencv_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double R00 = camera[i];
+        const double R01 = camera[n + i];
+        const double R02 = camera[2*n + i];
+        const double tx = camera[3*n + i];
+        const double R10 = camera[4*n + i];
+        const double R11 = camera[5*n + i];
+        const double R12 = camera[6*n + i];
+        const double ty = camera[7*n + i];
+        const double R20 = camera[8*n + i];
+        const double R21 = camera[9*n + i];
+        const double R22 = camera[10*n + i];
+        const double tz = camera[11*n + i];
+        const double fx = camera[12*n + i];
+        const double fy = camera[13*n + i];
+        const double cx = camera[14*n + i];
+        const double cy = camera[15*n + i];
+        const double k1 = camera[16*n + i];
+        const double k2 = camera[17*n + i];
+        const double p1 = camera[18*n + i];
+        const double p2 = camera[19*n + i];
+        const double k3 = camera[20*n + i];
+        const double k4 = camera[21*n + i];
+        const double k5 = camera[22*n + i];
+        const double k6 = camera[23*n + i];
+        const double X0 = X[i];
+        const double X1 = X[n + i];
+        const double X2 = X[2*n + i];
+        const double q0 = q[i];
+        const double q1 = q[n + i];
+        const double t0 = 2.0*p1;
+        const double h1 = ty + R10*X0 + R11*X1 + R12*X2;
+        const double h2 = tz + R20*X0 + R21*X1 + R22*X2;
+        const double inverse_depth = 1.0/h2;
+        const double v = h1*inverse_depth;
+        const double t1 = t0*v;
+        const double h0 = tx + R00*X0 + R01*X1 + R02*X2;
+        const double u = h0*inverse_depth;
+        const double t3 = u*u;
+        const double t4 = v*v;
+        const double t5 = t3 + t4;
+        const double t10 = k6*t5;
+        const double t11 = k5 + t10;
+        const double t12 = k4 + t11*t5;
+        const double t13 = 1.0 + t12*t5;
+        const double t14 = 1.0/t13;
+        const double t6 = k3*t5;
+        const double t7 = k2 + t6;
+        const double t8 = k1 + t5*t7;
+        const double t9 = 1.0 + t5*t8;
+        const double t15 = t14*t9;
+        const double t2 = p2*u;
+        const double t22 = 2.0*v;
+        const double t16 = 2.0*u;
+        const double t17 = t16*t8 + t5*(t16*t6 + t16*t7);
+        const double t18 = t14*u;
+        const double t19 = -t12*t16 - t5*(t10*t16 + t11*t16);
+        const double t20 = t9/(t13*t13);
+        const double t21 = t20*u;
+        const double b00 = fx*(t1 + t15 + 6.0*t2 + t17*t18 + t19*t21);
+        const double t28 = b00*inverse_depth;
+        const double a00 = t28;
+        const double t23 = t22*t8 + t5*(t22*t6 + t22*t7);
+        const double t24 = -t12*t22 - t5*(t10*t22 + t11*t22);
+        const double t25 = p2*t22 + t0*u;
+        const double b01 = fx*(t25 + t18*t23 + t21*t24);
+        const double t29 = b01*inverse_depth;
+        const double a01 = t29;
+        const double a02 = -t28*u - t29*v;
+        const double t26 = t14*v;
+        const double t27 = t20*v;
+        const double b10 = fy*(t25 + t17*t26 + t19*t27);
+        const double t30 = b10*inverse_depth;
+        const double a10 = t30;
+        const double b11 = fy*(t15 + 2.0*t2 + 6.0*p1*v + t23*t26 + t24*t27);
+        const double t31 = b11*inverse_depth;
+        const double a11 = t31;
+        const double a12 = -t30*u - t31*v;
+        r[i] = q0 - cx - fx*(p2*(3.0*t3 + t4) + t1*u + t15*u);
+        r[n + i] = q1 - cy - fy*(p1*(t3 + 3.0*t4) + t15*v + t2*t22);
+        J_point[i] = R00*a00 + R10*a01 + R20*a02;
+        J_point[n + i] = R01*a00 + R11*a01 + R21*a02;
+        J_point[2*n + i] = R02*a00 + R12*a01 + R22*a02;
+        J_point[3*n + i] = R00*a10 + R10*a11 + R20*a12;
+        J_point[4*n + i] = R01*a10 + R11*a11 + R21*a12;
+        J_point[5*n + i] = R02*a10 + R12*a11 + R22*a12;
+    }
+}
+
 /* Formula: FULL_OPENCV camera moved by an update (wx, wy, wz, dx, dy, dz, fx, fy, cx, cy, k1,
    k2, p1, p2, k3, k4, k5, k6).
    Inputs:  camera (24,), delta (18,)

@@ -234,6 +234,91 @@ EG_EXPORT void eg_opencv_observe(
     }
 }
 
+/* Formula: r = q - q_hat of a point in the camera OPENCV, and the Jacobian of the image by
+   the point.
+   Inputs:  camera (20,), X (3,), q (2,)
+   Outputs: r (2,), J_point (2, 3)
+   Operations: 125, temporaries: 34. */
+EG_EXPORT void eg_opencv_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double R00 = camera[i];
+        const double R01 = camera[n + i];
+        const double R02 = camera[2*n + i];
+        const double tx = camera[3*n + i];
+        const double R10 = camera[4*n + i];
+        const double R11 = camera[5*n + i];
+        const double R12 = camera[6*n + i];
+        const double ty = camera[7*n + i];
+        const double R20 = camera[8*n + i];
+        const double R21 = camera[9*n + i];
+        const double R22 = camera[10*n + i];
+        const double tz = camera[11*n + i];
+        const double fx = camera[12*n + i];
+        const double fy = camera[13*n + i];
+        const double cx = camera[14*n + i];
+        const double cy = camera[15*n + i];
+        const double k1 = camera[16*n + i];
+        const double k2 = camera[17*n + i];
+        const double p1 = camera[18*n + i];
+        const double p2 = camera[19*n + i];
+        const double X0 = X[i];
+        const double X1 = X[n + i];
+        const double X2 = X[2*n + i];
+        const double q0 = q[i];
+        const double q1 = q[n + i];
+        const double h0 = tx + R00*X0 + R01*X1 + R02*X2;
+        const double h2 = tz + R20*X0 + R21*X1 + R22*X2;
+        const double inverse_depth = 1.0/h2;
+        const double u = h0*inverse_depth;
+        const double t0 = u*u;
+        const double h1 = ty + R10*X0 + R11*X1 + R12*X2;
+        const double v = h1*inverse_depth;
+        const double t1 = v*v;
+        const double t2 = t0 + t1;
+        const double t3 = k2*t2;
+        const double t4 = k1 + t3;
+        const double t10 = 1.0 + t2*t4;
+        const double t7 = 2.0*p1;
+        const double t8 = t7*v;
+        const double t11 = 2.0*v;
+        const double t9 = p2*u;
+        const double t5 = 2.0*t4;
+        const double t6 = 2.0*t3*u + t5*u;
+        const double b00 = fx*(t10 + t8 + 6.0*t9 + t6*u);
+        const double t14 = b00*inverse_depth;
+        const double a00 = t14;
+        const double t12 = t11*t3 + t5*v;
+        const double t13 = p2*t11 + t7*u;
+        const double b01 = fx*(t13 + t12*u);
+        const double t15 = b01*inverse_depth;
+        const double a01 = t15;
+        const double a02 = -t14*u - t15*v;
+        const double b10 = fy*(t13 + t6*v);
+        const double t16 = b10*inverse_depth;
+        const double a10 = t16;
+        const double b11 = fy*(t10 + 2.0*t9 + 6.0*p1*v + t12*v);
+        const double t17 = b11*inverse_depth;
+        const double a11 = t17;
+        const double a12 = -t16*u - t17*v;
+        r[i] = q0 - cx - fx*(p2*(3.0*t0 + t1) + t10*u + t8*u);
+        r[n + i] = q1 - cy - fy*(p1*(t0 + 3.0*t1) + t10*v + t11*t9);
+        J_point[i] = R00*a00 + R10*a01 + R20*a02;
+        J_point[n + i] = R01*a00 + R11*a01 + R21*a02;
+        J_point[2*n + i] = R02*a00 + R12*a01 + R22*a02;
+        J_point[3*n + i] = R00*a10 + R10*a11 + R20*a12;
+        J_point[4*n + i] = R01*a10 + R11*a11 + R21*a12;
+        J_point[5*n + i] = R02*a10 + R12*a11 + R22*a12;
+    }
+}
+
 /* Formula: OPENCV camera moved by an update (wx, wy, wz, dx, dy, dz, fx, fy, cx, cy, k1, k2,
    p1, p2).
    Inputs:  camera (20,), delta (14,)

@@ -245,6 +245,113 @@ EG_EXPORT void eg_opencv_fisheye_observe(
     }
 }
 
+/* Formula: r = q - q_hat of a point in the camera OPENCV_FISHEYE, and the Jacobian of the
+   image by the point.
+   Inputs:  camera (20,), X (3,), q (2,)
+   Outputs: r (2,), J_point (2, 3)
+   Operations: 178, temporaries: 56. */
+EG_EXPORT void eg_opencv_fisheye_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double R00 = camera[i];
+        const double R01 = camera[n + i];
+        const double R02 = camera[2*n + i];
+        const double tx = camera[3*n + i];
+        const double R10 = camera[4*n + i];
+        const double R11 = camera[5*n + i];
+        const double R12 = camera[6*n + i];
+        const double ty = camera[7*n + i];
+        const double R20 = camera[8*n + i];
+        const double R21 = camera[9*n + i];
+        const double R22 = camera[10*n + i];
+        const double tz = camera[11*n + i];
+        const double fx = camera[12*n + i];
+        const double fy = camera[13*n + i];
+        const double cx = camera[14*n + i];
+        const double cy = camera[15*n + i];
+        const double k1 = camera[16*n + i];
+        const double k2 = camera[17*n + i];
+        const double k3 = camera[18*n + i];
+        const double k4 = camera[19*n + i];
+        const double X0 = X[i];
+        const double X1 = X[n + i];
+        const double X2 = X[2*n + i];
+        const double q0 = q[i];
+        const double q1 = q[n + i];
+        const double h0 = tx + R00*X0 + R01*X1 + R02*X2;
+        const double h2 = tz + R20*X0 + R21*X1 + R22*X2;
+        const double t0 = h2*h2;
+        const double t1 = 1e-40*t0;
+        const double t2 = h0*h0;
+        const double h1 = ty + R10*X0 + R11*X1 + R12*X2;
+        const double t3 = h1*h1;
+        const double t4 = t2 + t3;
+        const double t5 = t1 + t4;
+        const double t6 = sqrt(t5);
+        const double t7 = atan2(t6, h2);
+        const double t10 = t7*t7;
+        const double t11 = k3 + k4*t10;
+        const double t12 = k2 + t10*t11;
+        const double t13 = k1 + t10*t12;
+        const double t14 = 1.0 + t10*t13;
+        const double t15 = fx*t14;
+        const double t8 = 1.0/t6;
+        const double t9 = t7*t8;
+        const double t16 = t15*t9;
+        const double t44 = fy*t9;
+        const double t46 = t14*t44;
+        const double t17 = t15*t2;
+        const double t18 = 1.0/(1.0*t0 + t4);
+        const double t19 = h2*t18;
+        const double t20 = t19/t5;
+        const double t21 = t7/(t5*sqrt(t5));
+        const double t22 = h0*t9;
+        const double t23 = 2.0*t19;
+        const double t24 = t22*t23;
+        const double t25 = k4*t7*t7*t7;
+        const double t26 = t18*t8;
+        const double t27 = 2.0*h2*t25*t26;
+        const double t28 = t10*(t10*(h0*t27 + t11*t24) + t12*t24) + t13*t24;
+        const double t29 = fx*t22;
+        const double a00 = t16 + t17*t20 + t28*t29 - t17*t21;
+        const double t30 = h0*t15;
+        const double t31 = h1*t30;
+        const double t32 = h1*t23*t9;
+        const double t33 = t10*(t10*(h1*t27 + t11*t32) + t12*t32) + t13*t32;
+        const double a01 = t20*t31 + t29*t33 - t21*t31;
+        const double t34 = 1e-40*h2;
+        const double t35 = t18*t6;
+        const double t36 = t8*(t1*t26 - t35);
+        const double t37 = 2e-40*t0*t26 - 2.0*t35;
+        const double t38 = t37*t7;
+        const double t39 = t10*(t10*(t11*t38 + t25*t37) + t12*t38) + t13*t38;
+        const double a02 = t29*t39 + t30*t36 - t21*t30*t34;
+        const double t40 = fy*t14;
+        const double t41 = h1*t40;
+        const double t42 = t21*t40;
+        const double t43 = h1*t42;
+        const double t45 = h1*t44;
+        const double a10 = t28*t45 + h0*t20*t41 - h0*t43;
+        const double a11 = t46 + t33*t45 + t20*t3*t40 - t3*t42;
+        const double a12 = t36*t41 + t39*t45 - t34*t43;
+        r[i] = q0 - cx - h0*t16;
+        r[n + i] = q1 - cy - h1*t46;
+        J_point[i] = R00*a00 + R10*a01 + R20*a02;
+        J_point[n + i] = R01*a00 + R11*a01 + R21*a02;
+        J_point[2*n + i] = R02*a00 + R12*a01 + R22*a02;
+        J_point[3*n + i] = R00*a10 + R10*a11 + R20*a12;
+        J_point[4*n + i] = R01*a10 + R11*a11 + R21*a12;
+        J_point[5*n + i] = R02*a10 + R12*a11 + R22*a12;
+    }
+}
+
 /* Formula: OPENCV_FISHEYE camera moved by an update (wx, wy, wz, dx, dy, dz, fx, fy, cx, cy,
    k1, k2, k3, k4).
    Inputs:  camera (20,), delta (14,)

@@ -168,6 +168,63 @@ EG_EXPORT void eg_simple_pinhole_observe(
     }
 }
 
+/* Formula: r = q - q_hat of a point in the camera SIMPLE_PINHOLE, and the Jacobian of the
+   image by the point.
+   Inputs:  camera (15,), X (3,), q (2,)
+   Outputs: r (2,), J_point (2, 3)
+   Operations: 50, temporaries: 11. */
+EG_EXPORT void eg_simple_pinhole_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double R00 = camera[i];
+        const double R01 = camera[n + i];
+        const double R02 = camera[2*n + i];
+        const double tx = camera[3*n + i];
+        const double R10 = camera[4*n + i];
+        const double R11 = camera[5*n + i];
+        const double R12 = camera[6*n + i];
+        const double ty = camera[7*n + i];
+        const double R20 = camera[8*n + i];
+        const double R21 = camera[9*n + i];
+        const double R22 = camera[10*n + i];
+        const double tz = camera[11*n + i];
+        const double f = camera[12*n + i];
+        const double cx = camera[13*n + i];
+        const double cy = camera[14*n + i];
+        const double X0 = X[i];
+        const double X1 = X[n + i];
+        const double X2 = X[2*n + i];
+        const double q0 = q[i];
+        const double q1 = q[n + i];
+        const double h0 = tx + R00*X0 + R01*X1 + R02*X2;
+        const double h2 = tz + R20*X0 + R21*X1 + R22*X2;
+        const double inverse_depth = 1.0/h2;
+        const double u = h0*inverse_depth;
+        const double h1 = ty + R10*X0 + R11*X1 + R12*X2;
+        const double v = h1*inverse_depth;
+        const double t0 = f*inverse_depth;
+        const double a00 = t0;
+        const double a02 = -t0*u;
+        const double a11 = t0;
+        const double a12 = -t0*v;
+        r[i] = q0 - cx - f*u;
+        r[n + i] = q1 - cy - f*v;
+        J_point[i] = R00*a00 + R20*a02;
+        J_point[n + i] = R01*a00 + R21*a02;
+        J_point[2*n + i] = R02*a00 + R22*a02;
+        J_point[3*n + i] = R10*a11 + R20*a12;
+        J_point[4*n + i] = R11*a11 + R21*a12;
+        J_point[5*n + i] = R12*a11 + R22*a12;
+    }
+}
+
 /* Formula: SIMPLE_PINHOLE camera moved by an update (wx, wy, wz, dx, dy, dz, f, cx, cy).
    Inputs:  camera (15,), delta (9,)
    Outputs: moved (15,)

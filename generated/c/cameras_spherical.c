@@ -162,6 +162,67 @@ EG_EXPORT void eg_spherical_observe(
     }
 }
 
+/* Formula: r = q - q_hat of a point in the camera spherical, and the Jacobian of the image by
+   the point.
+   Inputs:  camera (14,), X (3,), q (2,)
+   Outputs: r (2,), J_point (2, 3)
+   Operations: 84, temporaries: 16. */
+EG_EXPORT void eg_spherical_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double R00 = camera[i];
+        const double R01 = camera[n + i];
+        const double R02 = camera[2*n + i];
+        const double tx = camera[3*n + i];
+        const double R10 = camera[4*n + i];
+        const double R11 = camera[5*n + i];
+        const double R12 = camera[6*n + i];
+        const double ty = camera[7*n + i];
+        const double R20 = camera[8*n + i];
+        const double R21 = camera[9*n + i];
+        const double R22 = camera[10*n + i];
+        const double tz = camera[11*n + i];
+        const double width = camera[12*n + i];
+        const double height = camera[13*n + i];
+        const double X0 = X[i];
+        const double X1 = X[n + i];
+        const double X2 = X[2*n + i];
+        const double q0 = q[i];
+        const double q1 = q[n + i];
+        const double h0 = tx + R00*X0 + R01*X1 + R02*X2;
+        const double h2 = tz + R20*X0 + R21*X1 + R22*X2;
+        const double t1 = 1.0/3.141592653589793;
+        const double t2 = 0.5*t1;
+        const double t7 = width*(0.5 + t2*atan2(h0, h2));
+        const double h1 = ty + R10*X0 + R11*X1 + R12*X2;
+        const double t0 = h0*h0 + h2*h2;
+        const double t4 = sqrt(t0);
+        const double t3 = t2*width/t0;
+        const double a00 = h2*t3;
+        const double a02 = -h0*t3;
+        const double t5 = height*t1/(h1*h1 + t0);
+        const double t6 = h1*t5/t4;
+        const double a10 = -h0*t6;
+        const double a11 = t4*t5;
+        const double a12 = -h2*t6;
+        r[i] = q0 - t7 - width*floor(0.5 + (q0 - t7)/width);
+        r[n + i] = q1 - height*(0.5 + t1*atan2(h1, t4));
+        J_point[i] = R00*a00 + R20*a02;
+        J_point[n + i] = R01*a00 + R21*a02;
+        J_point[2*n + i] = R02*a00 + R22*a02;
+        J_point[3*n + i] = R00*a10 + R10*a11 + R20*a12;
+        J_point[4*n + i] = R01*a10 + R11*a11 + R21*a12;
+        J_point[5*n + i] = R02*a10 + R12*a11 + R22*a12;
+    }
+}
+
 /* Formula: spherical camera moved by an update (wx, wy, wz, dx, dy, dz).
    Inputs:  camera (14,), delta (6,)
    Outputs: moved (14,)

@@ -126,6 +126,11 @@ EG_EXPORT void eg_point_step(
     double *EG_RESTRICT step,
     double *EG_RESTRICT promised);
 
+EG_EXPORT void eg_inverse_root3(
+    ptrdiff_t n,
+    const double *EG_RESTRICT N,
+    double *EG_RESTRICT T);
+
 EG_EXPORT void eg_project(
     ptrdiff_t n,
     const double *EG_RESTRICT P,
@@ -185,6 +190,14 @@ EG_EXPORT void eg_affine_observe(
     double *EG_RESTRICT J_camera,
     double *EG_RESTRICT J_point);
 
+EG_EXPORT void eg_affine_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point);
+
 EG_EXPORT void eg_affine_retract(
     ptrdiff_t n,
     const double *EG_RESTRICT camera,
@@ -228,6 +241,14 @@ EG_EXPORT void eg_bal_observe(
     const double *EG_RESTRICT q,
     double *EG_RESTRICT r,
     double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_bal_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
     double *EG_RESTRICT J_point);
 
 EG_EXPORT void eg_bal_retract(
@@ -276,6 +297,14 @@ EG_EXPORT void eg_brown_observe(
     double *EG_RESTRICT J_camera,
     double *EG_RESTRICT J_point);
 
+EG_EXPORT void eg_brown_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point);
+
 EG_EXPORT void eg_brown_retract(
     ptrdiff_t n,
     const double *EG_RESTRICT camera,
@@ -320,6 +349,14 @@ EG_EXPORT void eg_full_opencv_observe(
     const double *EG_RESTRICT q,
     double *EG_RESTRICT r,
     double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_full_opencv_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
     double *EG_RESTRICT J_point);
 
 EG_EXPORT void eg_full_opencv_retract(
@@ -368,6 +405,14 @@ EG_EXPORT void eg_opencv_observe(
     double *EG_RESTRICT J_camera,
     double *EG_RESTRICT J_point);
 
+EG_EXPORT void eg_opencv_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point);
+
 EG_EXPORT void eg_opencv_retract(
     ptrdiff_t n,
     const double *EG_RESTRICT camera,
@@ -412,6 +457,14 @@ EG_EXPORT void eg_opencv_fisheye_observe(
     const double *EG_RESTRICT q,
     double *EG_RESTRICT r,
     double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_opencv_fisheye_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
     double *EG_RESTRICT J_point);
 
 EG_EXPORT void eg_opencv_fisheye_retract(
@@ -460,6 +513,14 @@ EG_EXPORT void eg_pinhole_observe(
     double *EG_RESTRICT J_camera,
     double *EG_RESTRICT J_point);
 
+EG_EXPORT void eg_pinhole_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point);
+
 EG_EXPORT void eg_pinhole_retract(
     ptrdiff_t n,
     const double *EG_RESTRICT camera,
@@ -506,6 +567,14 @@ EG_EXPORT void eg_projective_observe(
     double *EG_RESTRICT J_camera,
     double *EG_RESTRICT J_point);
 
+EG_EXPORT void eg_projective_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point);
+
 EG_EXPORT void eg_projective_retract(
     ptrdiff_t n,
     const double *EG_RESTRICT camera,
@@ -549,6 +618,14 @@ EG_EXPORT void eg_radial_observe(
     const double *EG_RESTRICT q,
     double *EG_RESTRICT r,
     double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_radial_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
     double *EG_RESTRICT J_point);
 
 EG_EXPORT void eg_radial_retract(
@@ -597,6 +674,14 @@ EG_EXPORT void eg_simple_pinhole_observe(
     double *EG_RESTRICT J_camera,
     double *EG_RESTRICT J_point);
 
+EG_EXPORT void eg_simple_pinhole_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point);
+
 EG_EXPORT void eg_simple_pinhole_retract(
     ptrdiff_t n,
     const double *EG_RESTRICT camera,
@@ -643,6 +728,14 @@ EG_EXPORT void eg_simple_radial_observe(
     double *EG_RESTRICT J_camera,
     double *EG_RESTRICT J_point);
 
+EG_EXPORT void eg_simple_radial_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point);
+
 EG_EXPORT void eg_simple_radial_retract(
     ptrdiff_t n,
     const double *EG_RESTRICT camera,
@@ -687,6 +780,14 @@ EG_EXPORT void eg_spherical_observe(
     const double *EG_RESTRICT q,
     double *EG_RESTRICT r,
     double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_spherical_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
     double *EG_RESTRICT J_point);
 
 EG_EXPORT void eg_spherical_retract(
@@ -1258,6 +1359,13 @@ typedef struct {
         const double *EG_RESTRICT q,
         double *EG_RESTRICT r,
         double *EG_RESTRICT J_camera,
+        double *EG_RESTRICT J_point);
+    void (*sight)(
+        ptrdiff_t n,
+        const double *EG_RESTRICT camera,
+        const double *EG_RESTRICT X,
+        const double *EG_RESTRICT q,
+        double *EG_RESTRICT r,
         double *EG_RESTRICT J_point);
     void (*retract)(
         ptrdiff_t n,

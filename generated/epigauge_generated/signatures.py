@@ -46,7 +46,7 @@ class Model:
     homogeneous: bool
 
 
-C_DIGEST = "45ba7b7efc994aca"
+C_DIGEST = "74b164d1656bc46c"
 
 SIGNATURES = {
     "block_fundamental": Signature(
@@ -127,6 +127,12 @@ SIGNATURES = {
         (Argument("step", (4,), True), Argument("promised", (), True), ),
         "a point's own damped step -(N + lam (N + W))^-1 g and the decrease of the cost that it promises at most, g^T (N + lam (N + W))^-1 g; upper triangles.",
     ),
+    "inverse_root3": Signature(
+        "bundle",
+        (Argument("N", (6,), True), ),
+        (Argument("T", (3, 3), True), ),
+        "upper triangular T with T T^T = N^-1 for a 3x3 matrix, from its upper triangle.",
+    ),
     "project": Signature(
         "camera",
         (Argument("P", (3, 4), True), Argument("Q", (4,), True), ),
@@ -175,6 +181,12 @@ SIGNATURES = {
         (Argument("r", (2,), True), Argument("J_camera", (2, 8), True), Argument("J_point", (2, 3), True), ),
         "r = q - q_hat of a point in the camera affine, and the Jacobians of the image by the update of the camera (dP00, dP01, dP02, dP03, dP10, dP11, dP12, dP13) and by the point.",
     ),
+    "affine_sight": Signature(
+        "cameras_affine",
+        (Argument("camera", (12,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
+        (Argument("r", (2,), True), Argument("J_point", (2, 3), True), ),
+        "r = q - q_hat of a point in the camera affine, and the Jacobian of the image by the point.",
+    ),
     "affine_retract": Signature(
         "cameras_affine",
         (Argument("camera", (12,), True), Argument("delta", (8,), True), ),
@@ -216,6 +228,12 @@ SIGNATURES = {
         (Argument("camera", (15,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
         (Argument("r", (2,), True), Argument("J_camera", (2, 9), True), Argument("J_point", (2, 3), True), ),
         "r = q - q_hat of a point in the camera bal, and the Jacobians of the image by the update of the camera (wx, wy, wz, dx, dy, dz, f, k1, k2) and by the point.",
+    ),
+    "bal_sight": Signature(
+        "cameras_bal",
+        (Argument("camera", (15,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
+        (Argument("r", (2,), True), Argument("J_point", (2, 3), True), ),
+        "r = q - q_hat of a point in the camera bal, and the Jacobian of the image by the point.",
     ),
     "bal_retract": Signature(
         "cameras_bal",
@@ -259,6 +277,12 @@ SIGNATURES = {
         (Argument("r", (2,), True), Argument("J_camera", (2, 16), True), Argument("J_point", (2, 3), True), ),
         "r = q - q_hat of a point in the camera brown, and the Jacobians of the image by the update of the camera (wx, wy, wz, dx, dy, dz, c, x0, y0, A1, A2, A3, B1, B2, C1, C2) and by the point.",
     ),
+    "brown_sight": Signature(
+        "cameras_brown",
+        (Argument("camera", (23,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
+        (Argument("r", (2,), True), Argument("J_point", (2, 3), True), ),
+        "r = q - q_hat of a point in the camera brown, and the Jacobian of the image by the point.",
+    ),
     "brown_retract": Signature(
         "cameras_brown",
         (Argument("camera", (23,), True), Argument("delta", (16,), True), ),
@@ -300,6 +324,12 @@ SIGNATURES = {
         (Argument("camera", (24,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
         (Argument("r", (2,), True), Argument("J_camera", (2, 18), True), Argument("J_point", (2, 3), True), ),
         "r = q - q_hat of a point in the camera FULL_OPENCV, and the Jacobians of the image by the update of the camera (wx, wy, wz, dx, dy, dz, fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6) and by the point.",
+    ),
+    "full_opencv_sight": Signature(
+        "cameras_full_opencv",
+        (Argument("camera", (24,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
+        (Argument("r", (2,), True), Argument("J_point", (2, 3), True), ),
+        "r = q - q_hat of a point in the camera FULL_OPENCV, and the Jacobian of the image by the point.",
     ),
     "full_opencv_retract": Signature(
         "cameras_full_opencv",
@@ -343,6 +373,12 @@ SIGNATURES = {
         (Argument("r", (2,), True), Argument("J_camera", (2, 14), True), Argument("J_point", (2, 3), True), ),
         "r = q - q_hat of a point in the camera OPENCV, and the Jacobians of the image by the update of the camera (wx, wy, wz, dx, dy, dz, fx, fy, cx, cy, k1, k2, p1, p2) and by the point.",
     ),
+    "opencv_sight": Signature(
+        "cameras_opencv",
+        (Argument("camera", (20,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
+        (Argument("r", (2,), True), Argument("J_point", (2, 3), True), ),
+        "r = q - q_hat of a point in the camera OPENCV, and the Jacobian of the image by the point.",
+    ),
     "opencv_retract": Signature(
         "cameras_opencv",
         (Argument("camera", (20,), True), Argument("delta", (14,), True), ),
@@ -384,6 +420,12 @@ SIGNATURES = {
         (Argument("camera", (20,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
         (Argument("r", (2,), True), Argument("J_camera", (2, 14), True), Argument("J_point", (2, 3), True), ),
         "r = q - q_hat of a point in the camera OPENCV_FISHEYE, and the Jacobians of the image by the update of the camera (wx, wy, wz, dx, dy, dz, fx, fy, cx, cy, k1, k2, k3, k4) and by the point.",
+    ),
+    "opencv_fisheye_sight": Signature(
+        "cameras_opencv_fisheye",
+        (Argument("camera", (20,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
+        (Argument("r", (2,), True), Argument("J_point", (2, 3), True), ),
+        "r = q - q_hat of a point in the camera OPENCV_FISHEYE, and the Jacobian of the image by the point.",
     ),
     "opencv_fisheye_retract": Signature(
         "cameras_opencv_fisheye",
@@ -427,6 +469,12 @@ SIGNATURES = {
         (Argument("r", (2,), True), Argument("J_camera", (2, 10), True), Argument("J_point", (2, 3), True), ),
         "r = q - q_hat of a point in the camera PINHOLE, and the Jacobians of the image by the update of the camera (wx, wy, wz, dx, dy, dz, fx, fy, cx, cy) and by the point.",
     ),
+    "pinhole_sight": Signature(
+        "cameras_pinhole",
+        (Argument("camera", (16,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
+        (Argument("r", (2,), True), Argument("J_point", (2, 3), True), ),
+        "r = q - q_hat of a point in the camera PINHOLE, and the Jacobian of the image by the point.",
+    ),
     "pinhole_retract": Signature(
         "cameras_pinhole",
         (Argument("camera", (16,), True), Argument("delta", (10,), True), ),
@@ -468,6 +516,12 @@ SIGNATURES = {
         (Argument("camera", (12,), True), Argument("X", (4,), True), Argument("q", (2,), True), ),
         (Argument("r", (2,), True), Argument("J_camera", (2, 12), True), Argument("J_point", (2, 4), True), ),
         "r = q - q_hat of a point in the camera projective, and the Jacobians of the image by the update of the camera (dP00, dP01, dP02, dP03, dP10, dP11, dP12, dP13, dP20, dP21, dP22, dP23) and by the point.",
+    ),
+    "projective_sight": Signature(
+        "cameras_projective",
+        (Argument("camera", (12,), True), Argument("X", (4,), True), Argument("q", (2,), True), ),
+        (Argument("r", (2,), True), Argument("J_point", (2, 4), True), ),
+        "r = q - q_hat of a point in the camera projective, and the Jacobian of the image by the point.",
     ),
     "projective_retract": Signature(
         "cameras_projective",
@@ -511,6 +565,12 @@ SIGNATURES = {
         (Argument("r", (2,), True), Argument("J_camera", (2, 11), True), Argument("J_point", (2, 3), True), ),
         "r = q - q_hat of a point in the camera RADIAL, and the Jacobians of the image by the update of the camera (wx, wy, wz, dx, dy, dz, f, cx, cy, k1, k2) and by the point.",
     ),
+    "radial_sight": Signature(
+        "cameras_radial",
+        (Argument("camera", (17,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
+        (Argument("r", (2,), True), Argument("J_point", (2, 3), True), ),
+        "r = q - q_hat of a point in the camera RADIAL, and the Jacobian of the image by the point.",
+    ),
     "radial_retract": Signature(
         "cameras_radial",
         (Argument("camera", (17,), True), Argument("delta", (11,), True), ),
@@ -552,6 +612,12 @@ SIGNATURES = {
         (Argument("camera", (15,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
         (Argument("r", (2,), True), Argument("J_camera", (2, 9), True), Argument("J_point", (2, 3), True), ),
         "r = q - q_hat of a point in the camera SIMPLE_PINHOLE, and the Jacobians of the image by the update of the camera (wx, wy, wz, dx, dy, dz, f, cx, cy) and by the point.",
+    ),
+    "simple_pinhole_sight": Signature(
+        "cameras_simple_pinhole",
+        (Argument("camera", (15,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
+        (Argument("r", (2,), True), Argument("J_point", (2, 3), True), ),
+        "r = q - q_hat of a point in the camera SIMPLE_PINHOLE, and the Jacobian of the image by the point.",
     ),
     "simple_pinhole_retract": Signature(
         "cameras_simple_pinhole",
@@ -595,6 +661,12 @@ SIGNATURES = {
         (Argument("r", (2,), True), Argument("J_camera", (2, 10), True), Argument("J_point", (2, 3), True), ),
         "r = q - q_hat of a point in the camera SIMPLE_RADIAL, and the Jacobians of the image by the update of the camera (wx, wy, wz, dx, dy, dz, f, cx, cy, k) and by the point.",
     ),
+    "simple_radial_sight": Signature(
+        "cameras_simple_radial",
+        (Argument("camera", (16,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
+        (Argument("r", (2,), True), Argument("J_point", (2, 3), True), ),
+        "r = q - q_hat of a point in the camera SIMPLE_RADIAL, and the Jacobian of the image by the point.",
+    ),
     "simple_radial_retract": Signature(
         "cameras_simple_radial",
         (Argument("camera", (16,), True), Argument("delta", (10,), True), ),
@@ -636,6 +708,12 @@ SIGNATURES = {
         (Argument("camera", (14,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
         (Argument("r", (2,), True), Argument("J_camera", (2, 6), True), Argument("J_point", (2, 3), True), ),
         "r = q - q_hat of a point in the camera spherical, and the Jacobians of the image by the update of the camera (wx, wy, wz, dx, dy, dz) and by the point.",
+    ),
+    "spherical_sight": Signature(
+        "cameras_spherical",
+        (Argument("camera", (14,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
+        (Argument("r", (2,), True), Argument("J_point", (2, 3), True), ),
+        "r = q - q_hat of a point in the camera spherical, and the Jacobian of the image by the point.",
     ),
     "spherical_retract": Signature(
         "cameras_spherical",

@@ -1,8 +1,8 @@
 /* Many views: the accumulation over observations, point by point, and the reduced system.
 
-   The readable reference is Python: epigauge/multi_view/problem.py, coupling.py, system.py. A test
-   compares both. Nothing here is a formula of the geometry: h, J_P, J_Q and all 4x4 algebra of a
-   point are generated kernels, run over many points at once.
+   The readable reference is Python: epigauge/bundle/numpy_linearizer.py. A test compares both.
+   Nothing here is a formula of the geometry: projections and Jacobians are generated kernels, run
+   over many points at once. A camera model is a row of eg_camera_models.
 
    Points are worked on in chunks of equal or similar numbers of observations. A chunk has M lanes
    (points, M a multiple of EG_LANES) and L slots: slot s holds the s-th observation of every lane,
@@ -14,7 +14,7 @@
 
 #include <stdint.h>
 
-#include "epigauge_kernels.h"
+#include "skyline.h"
 
 #define EG_LANES 8
 
@@ -42,16 +42,22 @@ typedef struct {
     double least;            /* least weight in the normal equations */
     double scale2;           /* squared scale of the loss */
     ptrdiff_t loss;          /* its number in losses.h */
+    ptrdiff_t model;         /* row of eg_camera_models, or EG_FACTORED */
+    ptrdiff_t width;         /* entries of a camera's tangent that are computed with */
+    const int32_t *columns;  /* their numbers; not of the factored route */
 } eg_bundle;
 
-/* The lower triangle of the reduced system in blocks of 12x12: block row k holds those from column
-   first[k] to k, as one panel of twelve rows; entry (r, c) of the l-th of all blocks is at
-   144 l + 12 c + r. */
+/* Projective cameras by the factors of their Jacobian, see bundle_factored.c. */
+#define EG_FACTORED (-1)
+
+/* How points are refined on their own: most iterations, first lambda and what it is divided or
+   multiplied by, relative decrease that ends it; damping by tr(V) / 3 I or V (not of the factored
+   route, which adds the blocks of depths to V). */
+enum { EG_TRACE, EG_BLOCK };
 typedef struct {
-    ptrdiff_t n;
-    const int32_t *first;
-    const ptrdiff_t *slot; /* (n + 1): number of the first block of each row */
-} eg_envelope;
+    ptrdiff_t iterations, damping;
+    double lam, factor, tolerance;
+} eg_refinement;
 
 /* ---------------------------------------------------------------- bundle.c */
 
@@ -59,52 +65,59 @@ EG_EXPORT void eg_bundle_pack(
     eg_bundle *bundle, const ptrdiff_t *first, const ptrdiff_t *view, const double *q,
     const double *weights, int32_t *packed_view, double *packed_q, double *packed_weights);
 
+EG_EXPORT void eg_bundle_widths(const eg_bundle *bundle, ptrdiff_t *widths);
+
 EG_EXPORT int eg_bundle_costs(
-    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *P, const double *Q,
-    double *costs);
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras,
+    const double *points, double *costs);
 
 EG_EXPORT int eg_bundle_linearize(
-    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *P, const double *Q,
-    double *V, double *D, double *g, double *cameras);
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras,
+    const double *points, double *V, double *D, double *g, double *camera_sums);
 
-EG_EXPORT int eg_bundle_triangulate(
-    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *P, double *Q,
-    double *costs, ptrdiff_t iterations, double lam, double factor, double tolerance);
+EG_EXPORT int eg_bundle_refine_points(
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras, double *points,
+    double *costs, const unsigned char *frozen, const eg_refinement *how);
+
+/* ---------------------------------------------------------------- bundle_direct.c */
+
+EG_EXPORT ptrdiff_t eg_camera_model_row(const char *name);
+
+/* ---------------------------------------------------------------- bundle_points.c */
+
+EG_EXPORT int eg_bundle_inverse_roots(
+    ptrdiff_t m, ptrdiff_t b, const double *V, const double *W, ptrdiff_t width, double lam,
+    const double *g, double *T, double *half);
+
+EG_EXPORT double eg_bundle_point_steps(
+    ptrdiff_t m, ptrdiff_t b, const double *T, const double *half, const double *coupled,
+    const double *W, ptrdiff_t width, double *steps);
 
 /* ---------------------------------------------------------------- bundle_schur.c */
 
-EG_EXPORT int eg_bundle_inverse_roots(
-    ptrdiff_t m, const double *V, const double *W, double lam, const double *g, double *T,
-    double *half);
-
 EG_EXPORT int eg_bundle_schur(
-    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *P, const double *Q,
-    const double *T, const double *half, const eg_envelope *envelope, double *pairs,
-    double *cameras);
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras,
+    const double *points, const double *T, const double *half, const eg_envelope *envelope,
+    double *pairs, double *reduced);
 
 EG_EXPORT int eg_bundle_couple(
-    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *P, const double *Q,
-    const double *T, const double *x, const double *y, double *points, double *cameras);
-
-EG_EXPORT double eg_bundle_point_steps(
-    ptrdiff_t m, const double *T, const double *half, const double *coupled, const double *W,
-    double *step);
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras,
+    const double *points, const double *T, const double *x, const double *y, double *moved,
+    double *reduced);
 
 /* ---------------------------------------------------------------- bundle_reduced.c */
 
 EG_EXPORT void eg_bundle_camera_blocks(
-    ptrdiff_t n, const double *cameras, double *U, double *D, double *g);
+    const eg_bundle *bundle, const double *cameras, double *U, double *D, double *g);
+
+EG_EXPORT void eg_bundle_pair_blocks(
+    const eg_bundle *bundle, ptrdiff_t count, const double *pairs, double *blocks);
 
 EG_EXPORT int eg_bundle_whiten(
     ptrdiff_t n, const double *U, const double *W, double lam, double *A, double *white);
 
 EG_EXPORT void eg_bundle_reduce(
     const eg_envelope *envelope, const double *pairs, const double *U, const double *A, double *S);
-
-EG_EXPORT int eg_envelope_factor(const eg_envelope *envelope, double *S);
-
-EG_EXPORT void eg_envelope_solve(
-    const eg_envelope *envelope, const double *S, ptrdiff_t count, double *x);
 
 EG_EXPORT void eg_bundle_neighbours(const eg_bundle *bundle, unsigned char *together);
 

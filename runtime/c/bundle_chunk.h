@@ -1,4 +1,4 @@
-/* What the loops over chunks share: a chunk, its scratch memory, gathering, weights. */
+/* What the loops over chunks share: a chunk, a pass over its slots, weights, and the two routes. */
 #ifndef EPIGAUGE_BUNDLE_CHUNK_H
 #define EPIGAUGE_BUNDLE_CHUNK_H
 
@@ -8,11 +8,78 @@
 #include "bundle.h"
 #include "losses.h"
 
+/* Inlined wherever it is called: its sizes and functions are constants there. */
+#if defined(_MSC_VER)
+#define EG_INLINE static __forceinline
+#elif defined(__GNUC__)
+#define EG_INLINE static inline __attribute__((always_inline))
+#else
+#define EG_INLINE static inline
+#endif
+
 typedef struct {
     ptrdiff_t M, L;
     const int32_t *point, *count, *view;
     const double *q, *weights;
 } eg_chunk;
+
+typedef struct eg_route eg_route;
+
+/* A pass over chunks: where it is, and its memory. Arrays of lanes are observation-last. */
+typedef struct {
+    const eg_bundle *bundle;
+    const eg_route *route;
+    eg_chunk chunk;
+    double *memory;
+    double *points;  /* (b, M) */
+    double *moments; /* of the factored route */
+    double *cameras; /* (c, M), of the slot */
+    /* The slot: one observation of every lane; lanes beyond `filled` have none. */
+    ptrdiff_t filled;
+    const int32_t *view;
+    const double *q, *weights;
+    double *loss, *squared, *w; /* 3 M, M, M: the loss, squared residuals, weights */
+    double *work;
+    double *extra; /* what the caller has asked for */
+} eg_pass;
+
+/* What differs between the factored route of projective cameras, whose Jacobian is a (2, 3) times
+   the point's coordinates, and the direct one of any model, which has the Jacobian itself. The point
+   in a pass is where its lanes are. */
+struct eg_route {
+    int factored;
+    ptrdiff_t camera, point; /* entries of a stored camera and of a point */
+    ptrdiff_t tangent;       /* unknowns of a camera */
+    ptrdiff_t padded;        /* width of the rows of sums */
+    ptrdiff_t camera_sums, pair_sums; /* doubles a camera and a pair of cameras */
+    ptrdiff_t sums;          /* rows of a point's sums: V, its damping where it has one, g */
+    ptrdiff_t factors;       /* rows of an observation's factors of the coupling */
+    ptrdiff_t turned;        /* doubles an observation when pairs are added */
+    ptrdiff_t work;          /* rows of scratch */
+    /* Squared residuals. */
+    void (*squared)(const eg_pass *);
+    /* Sums of points, weights, squared residuals. */
+    void (*sight)(const eg_pass *, const double *points, double *own);
+    /* The same, and add to the sums of cameras. */
+    void (*observe)(const eg_pass *, double *own, double *cameras);
+    /* Factors F of the coupling of cameras and points times roots T of the points. */
+    void (*couple)(const eg_pass *, const double *roots, double *F);
+    /* v += (W T)^T x for x of the cameras, (tangent, M); cameras += W T v. */
+    void (*to_points)(const eg_pass *, const double *F, const double *x, double *v);
+    void (*to_cameras)(const eg_pass *, const double *F, const double *v, double *cameras);
+    /* Add W T T^T W^T of all pairs of observations of each point to their pairs of views. */
+    void (*pairs)(const eg_pass *, const eg_envelope *, const double *F, double *turned,
+                  ptrdiff_t *views, int32_t *sorted, double *pairs);
+};
+
+/* In bundle_factored.c and bundle_direct.c. */
+extern const eg_route eg_factored_route;
+eg_route eg_direct_route(const eg_bundle *bundle);
+
+static inline eg_route eg_route_of(const eg_bundle *bundle)
+{
+    return bundle->model < 0 ? eg_factored_route : eg_direct_route(bundle);
+}
 
 static inline eg_chunk eg_chunk_of(const eg_bundle *b, ptrdiff_t c)
 {
@@ -50,7 +117,8 @@ static inline double *eg_scratch(const eg_bundle *b, ptrdiff_t begin, ptrdiff_t 
 
 static inline void eg_release(double *scratch)
 {
-    free(((void **)scratch)[-1]);
+    if (scratch)
+        free(((void **)scratch)[-1]);
 }
 
 /* Lanes of a slot that hold an observation, given those of the slot before. */
@@ -85,6 +153,21 @@ static inline void eg_scatter(const eg_chunk *chunk, ptrdiff_t width, const doub
     }
 }
 
+/* Symmetric (b, b) matrices from their upper triangles, observation-last, into rows. */
+static inline void eg_scatter_symmetric(const eg_chunk *chunk, ptrdiff_t b,
+                                        const double *EG_RESTRICT in, double *rows)
+{
+    const ptrdiff_t M = chunk->M;
+    for (ptrdiff_t j = 0; j < M; ++j) {
+        if (!chunk->count[j])
+            continue;
+        double *row = rows + b * b * chunk->point[j];
+        for (ptrdiff_t i = 0, k = 0; i < b; ++i)
+            for (ptrdiff_t l = i; l < b; ++l, ++k)
+                row[b * i + l] = row[b * l + i] = in[k * M + j];
+    }
+}
+
 static inline void eg_add(ptrdiff_t n, const double *EG_RESTRICT values, double *EG_RESTRICT sums)
 {
     EG_SIMD
@@ -92,144 +175,80 @@ static inline void eg_add(ptrdiff_t n, const double *EG_RESTRICT values, double 
         sums[i] += values[i];
 }
 
-/* Weights in the normal equations of a slot, given its squared residuals unless the loss is linear.
-   `work` has 3 M entries. */
-static inline void eg_weigh(const eg_bundle *b, ptrdiff_t M, ptrdiff_t filled,
-                            const double *EG_RESTRICT weights, const double *EG_RESTRICT squared,
-                            double *EG_RESTRICT work, double *EG_RESTRICT w)
+/* A pass with so many more doubles a lane and a row; 1 where there is no memory. */
+static inline int eg_pass_begin(eg_pass *p, const eg_bundle *bundle, const eg_route *route,
+                                ptrdiff_t begin, ptrdiff_t end, ptrdiff_t a_lane, ptrdiff_t a_row)
 {
-    const double least = b->least;
+    const ptrdiff_t own = route->point + route->camera + 5 + route->work + (route->factored ? 16 : 0);
+    p->bundle = bundle;
+    p->route = route;
+    p->memory = eg_scratch(bundle, begin, end, own + a_lane, a_row);
+    return !p->memory;
+}
+
+/* Go to a chunk: its points (rows of all of them are given), their moments. */
+static inline void eg_pass_chunk(eg_pass *p, ptrdiff_t c, const double *points)
+{
+    p->chunk = eg_chunk_of(p->bundle, c);
+    const ptrdiff_t M = p->chunk.M;
+    p->points = p->memory;
+    p->cameras = p->points + p->route->point * M;
+    p->loss = p->cameras + p->route->camera * M;
+    p->squared = p->loss + 3 * M;
+    p->w = p->squared + M;
+    p->work = p->w + M;
+    p->moments = p->work + p->route->work * M;
+    p->extra = p->moments + (p->route->factored ? 16 * M : 0);
+    p->filled = M;
+    eg_gather(M, p->route->point, points, p->chunk.point, p->points);
+}
+
+/* Go to a slot, rising; its cameras are at hand in `cameras`. */
+static inline void eg_pass_slot_of(eg_pass *p, ptrdiff_t s, double *cameras)
+{
+    const ptrdiff_t M = p->chunk.M;
+    p->filled = eg_filled(&p->chunk, s, s ? p->filled : M);
+    p->view = p->chunk.view + s * M;
+    p->q = p->chunk.q + 2 * s * M;
+    p->weights = p->chunk.weights + s * M;
+    p->cameras = cameras;
+}
+
+static inline void eg_pass_slot(eg_pass *p, ptrdiff_t s, const double *cameras)
+{
+    eg_pass_slot_of(p, s, p->points + p->route->point * p->chunk.M);
+    eg_gather(p->chunk.M, p->route->camera, cameras, p->view, p->cameras);
+}
+
+/* Weights in the normal equations of a slot, given its squared residuals unless the loss is
+   linear. */
+static inline void eg_weigh(const eg_pass *p)
+{
+    const eg_bundle *b = p->bundle;
+    const double least = b->least, *weights = p->weights;
     const double *first = 0;
+    const ptrdiff_t M = p->chunk.M;
+    double *EG_RESTRICT w = p->w;
     if (b->loss != EG_LINEAR) {
-        eg_losses((int)b->loss, b->scale2, M, squared, work, work + M, work + 2 * M);
-        first = work + M;
+        eg_losses((int)b->loss, b->scale2, M, p->squared, p->loss, p->loss + M, p->loss + 2 * M);
+        first = p->loss + M;
     }
-    for (ptrdiff_t j = 0; j < filled; ++j) {
+    for (ptrdiff_t j = 0; j < p->filled; ++j) {
         const double value = first ? weights[j] * first[j] : weights[j];
         w[j] = value < least ? least : value;
     }
-    for (ptrdiff_t j = filled; j < M; ++j)
+    for (ptrdiff_t j = p->filled; j < M; ++j)
         w[j] = 0.0;
 }
 
-/* costs += weights rho(squared); `work` is as `eg_weigh` has left it. */
-static inline void eg_charge(const eg_bundle *b, ptrdiff_t M, const double *EG_RESTRICT weights,
-                             const double *EG_RESTRICT squared, const double *EG_RESTRICT work,
-                             double *EG_RESTRICT costs)
+/* costs += weights rho(squared); the loss is as `eg_weigh` has left it. */
+static inline void eg_charge(const eg_pass *p, double *EG_RESTRICT costs)
 {
-    const double *rho = b->loss != EG_LINEAR ? work : squared;
+    const double *rho = p->bundle->loss != EG_LINEAR ? p->loss : p->squared;
+    const double *weights = p->weights;
     EG_SIMD
-    for (ptrdiff_t j = 0; j < M; ++j)
+    for (ptrdiff_t j = 0; j < p->chunk.M; ++j)
         costs[j] += weights[j] * rho[j];
-}
-
-/* Loss and weights of a slot: squared residuals first where the loss needs them. */
-static inline void eg_weigh_at(const eg_bundle *b, ptrdiff_t M, ptrdiff_t filled, const double *P,
-                               const double *Q, const double *q, const double *weights,
-                               double *squared, double *work, double *w)
-{
-    if (b->loss != EG_LINEAR)
-        eg_squared_distance(M, P, Q, q, squared);
-    eg_weigh(b, M, filled, weights, squared, work, w);
-}
-
-/* Moments of the points of a chunk and the points themselves, 16 entries a lane. */
-static inline void eg_moments(ptrdiff_t M, const double *EG_RESTRICT points,
-                              double *EG_RESTRICT moments)
-{
-    for (ptrdiff_t j = 0; j < M; ++j) {
-        double *row = moments + 16 * j;
-        ptrdiff_t k = 0;
-        for (int i = 0; i < 4; ++i)
-            for (int l = i; l < 4; ++l)
-                row[k++] = points[i * M + j] * points[l * M + j];
-        row[10] = row[11] = 0.0;
-        for (int i = 0; i < 4; ++i)
-            row[12 + i] = points[i * M + j];
-    }
-}
-
-/* Add three factors (rows of `factors`, M apart) times the moments of one or more neighbouring lanes
-   to their sums: eight moments to `high`, four to `low`. The sums stay in registers meanwhile. */
-static inline void eg_accumulate(ptrdiff_t lanes, const double *EG_RESTRICT factors, ptrdiff_t M,
-                                 const double *EG_RESTRICT moments, double *EG_RESTRICT high,
-                                 double *EG_RESTRICT low)
-{
-    double a[8], b[8], c[8], d[4], e[4], f[4];
-    EG_SIMD
-    for (int k = 0; k < 8; ++k)
-        a[k] = high[k], b[k] = high[8 + k], c[k] = high[16 + k];
-    EG_SIMD
-    for (int k = 0; k < 4; ++k)
-        d[k] = low[k], e[k] = low[4 + k], f[k] = low[8 + k];
-    ptrdiff_t j = 0;
-    do {
-        const double *EG_RESTRICT moment = moments + 16 * j;
-        const double x = factors[j], y = factors[M + j], z = factors[2 * M + j];
-        EG_SIMD
-        for (int k = 0; k < 8; ++k)
-            a[k] += x * moment[k], b[k] += y * moment[k], c[k] += z * moment[k];
-        EG_SIMD
-        for (int k = 0; k < 4; ++k)
-            d[k] += x * moment[8 + k], e[k] += y * moment[8 + k], f[k] += z * moment[8 + k];
-    } while (++j < lanes);
-    EG_SIMD
-    for (int k = 0; k < 8; ++k)
-        high[k] = a[k], high[8 + k] = b[k], high[16 + k] = c[k];
-    EG_SIMD
-    for (int k = 0; k < 4; ++k)
-        low[k] = d[k], low[4 + k] = e[k], low[8 + k] = f[k];
-}
-
-/* The same for one factor. */
-static inline void eg_accumulate_one(ptrdiff_t lanes, const double *EG_RESTRICT factors,
-                                     const double *EG_RESTRICT moments, double *EG_RESTRICT high,
-                                     double *EG_RESTRICT low)
-{
-    double a[8], d[4];
-    EG_SIMD
-    for (int k = 0; k < 8; ++k)
-        a[k] = high[k];
-    EG_SIMD
-    for (int k = 0; k < 4; ++k)
-        d[k] = low[k];
-    ptrdiff_t j = 0;
-    do {
-        EG_SIMD
-        for (int k = 0; k < 8; ++k)
-            a[k] += factors[j] * moments[16 * j + k];
-        EG_SIMD
-        for (int k = 0; k < 4; ++k)
-            d[k] += factors[j] * moments[16 * j + 8 + k];
-    } while (++j < lanes);
-    EG_SIMD
-    for (int k = 0; k < 8; ++k)
-        high[k] = a[k];
-    EG_SIMD
-    for (int k = 0; k < 4; ++k)
-        low[k] = d[k];
-}
-
-/* Add three factors times Q of one or more neighbouring lanes: twelve sums. */
-static inline void eg_accumulate_points(ptrdiff_t lanes, const double *EG_RESTRICT factors,
-                                        ptrdiff_t M, const double *EG_RESTRICT moments,
-                                        double *EG_RESTRICT sums)
-{
-    double a[4], b[4], c[4];
-    EG_SIMD
-    for (int k = 0; k < 4; ++k)
-        a[k] = sums[k], b[k] = sums[4 + k], c[k] = sums[8 + k];
-    ptrdiff_t j = 0;
-    do {
-        const double *EG_RESTRICT point = moments + 16 * j + 12;
-        const double x = factors[j], y = factors[M + j], z = factors[2 * M + j];
-        EG_SIMD
-        for (int k = 0; k < 4; ++k)
-            a[k] += x * point[k], b[k] += y * point[k], c[k] += z * point[k];
-    } while (++j < lanes);
-    EG_SIMD
-    for (int k = 0; k < 4; ++k)
-        sums[k] = a[k], sums[4 + k] = b[k], sums[8 + k] = c[k];
 }
 
 /* End of the lanes from `begin` on that have the same view. */
@@ -240,10 +259,5 @@ static inline ptrdiff_t eg_run(const int32_t *view, ptrdiff_t begin, ptrdiff_t f
         ++end;
     return end;
 }
-
-/* In bundle_pairs.c. */
-void eg_add_to_pairs(const eg_chunk *chunk, const eg_envelope *envelope, const double *Y,
-                     const double *moments, double *X, double *turned, ptrdiff_t *views,
-                     int32_t *sorted, double *pairs);
 
 #endif

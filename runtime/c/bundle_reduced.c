@@ -1,20 +1,15 @@
-/* The reduced system of the cameras: blocks, whitening, Cholesky factor within an envelope. */
-#include <math.h>
+/* The blocks of the cameras' reduced system, from sums; whitening of projective cameras. */
 #include <string.h>
 
-#include "bundle.h"
-
-#define ROWS 12
-#define BLOCK (ROWS * ROWS)
-#define GROUP 8
+#include "bundle_chunk.h"
+#include "panels.h"
 
 /* Place of entry (k, l) of Q Q^T among its ten distinct ones, and of (a, b) among six of 3x3. */
 static const int moment_of[4][4] = {{0, 1, 2, 3}, {1, 4, 5, 6}, {2, 5, 7, 8}, {3, 6, 8, 9}};
 static const int upper_of[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
 
 /* Blocks of J^T J and of the depths (n, 12, 12), gradient (n, 12) from the sums of cameras. */
-void eg_bundle_camera_blocks(
-    ptrdiff_t n, const double *cameras, double *U, double *D, double *g)
+static void factored_blocks(ptrdiff_t n, const double *cameras, double *U, double *D, double *g)
 {
     memset(D, 0, (size_t)(n * BLOCK) * sizeof(double));
     for (ptrdiff_t i = 0; i < n; ++i) {
@@ -33,74 +28,40 @@ void eg_bundle_camera_blocks(
     }
 }
 
-/* x <- x - factor y for vectors of twelve. */
-static inline void subtract_multiple(double factor, const double *EG_RESTRICT y,
-                                     double *EG_RESTRICT x)
+/* Blocks U of J^T J (n, a, a), gradient g (n, a), and in the factored route blocks D of the depths,
+   from the sums of cameras. */
+void eg_bundle_camera_blocks(
+    const eg_bundle *bundle, const double *cameras, double *U, double *D, double *g)
 {
-    EG_SIMD
-    for (int k = 0; k < ROWS; ++k)
-        x[k] -= factor * y[k];
-}
-
-static inline void scale(double factor, double *x)
-{
-    EG_SIMD
-    for (int k = 0; k < ROWS; ++k)
-        x[k] *= factor;
-}
-
-/* L of A = L L^T in place, column by column; only the lower triangle is read, the upper one becomes
-   zero. Returns 1 where A is not positive definite. */
-static int factor_block(double *A)
-{
-    for (int j = 0; j < ROWS; ++j) {
-        const double pivot = A[ROWS * j + j];
-        if (!(pivot > 0.0 && pivot < INFINITY))
-            return 1;
-        scale(1.0 / sqrt(pivot), A + ROWS * j);
-        for (int i = 0; i < j; ++i)
-            A[ROWS * j + i] = 0.0;
-        for (int c = j + 1; c < ROWS; ++c)
-            subtract_multiple(A[ROWS * j + c], A + ROWS * j, A + ROWS * c);
-    }
-    return 0;
-}
-
-/* X <- X L^-T for X (12 rows) and a lower triangular L, both column by column. */
-static void divide_by_transposed(const double *EG_RESTRICT L, double *EG_RESTRICT X)
-{
-    for (int j = 0; j < ROWS; ++j) {
-        scale(1.0 / L[ROWS * j + j], X + ROWS * j);
-        for (int c = j + 1; c < ROWS; ++c)
-            subtract_multiple(L[ROWS * j + c], X + ROWS * j, X + ROWS * c);
-    }
-}
-
-/* C -= X Y^T for panels X and Y of so many columns. */
-static void subtract_product(ptrdiff_t columns, const double *EG_RESTRICT X,
-                             const double *EG_RESTRICT Y, double *EG_RESTRICT C)
-{
-    if (!columns)
+    const eg_route route = eg_route_of(bundle);
+    const ptrdiff_t a = route.tangent;
+    if (route.factored) {
+        factored_blocks(bundle->n_views, cameras, U, D, g);
         return;
-    for (int c = 0; c < ROWS; c += 4, C += 4 * ROWS) {
-        double a[8] = {0.0}, b[8] = {0.0}, d[8] = {0.0}, e[8] = {0.0};
-        double f[4] = {0.0}, g[4] = {0.0}, h[4] = {0.0}, i[4] = {0.0};
-        ptrdiff_t p = 0;
-        do {
-            const double *EG_RESTRICT x = X + ROWS * p, *EG_RESTRICT y = Y + ROWS * p + c;
-            EG_SIMD
-            for (int k = 0; k < 8; ++k)
-                a[k] += y[0] * x[k], b[k] += y[1] * x[k], d[k] += y[2] * x[k], e[k] += y[3] * x[k];
-            EG_SIMD
-            for (int k = 0; k < 4; ++k)
-                f[k] += y[0] * x[8 + k], g[k] += y[1] * x[8 + k], h[k] += y[2] * x[8 + k],
-                    i[k] += y[3] * x[8 + k];
-        } while (++p < columns);
-        for (int k = 0; k < 8; ++k)
-            C[k] -= a[k], C[ROWS + k] -= b[k], C[2 * ROWS + k] -= d[k], C[3 * ROWS + k] -= e[k];
-        for (int k = 0; k < 4; ++k)
-            C[8 + k] -= f[k], C[ROWS + 8 + k] -= g[k], C[2 * ROWS + 8 + k] -= h[k],
-                C[3 * ROWS + 8 + k] -= i[k];
+    }
+    for (ptrdiff_t i = 0; i < bundle->n_views; ++i) {
+        const double *sum = cameras + route.camera_sums * i;
+        for (ptrdiff_t k = 0; k < a; ++k)
+            memcpy(U + a * (a * i + k), sum + route.padded * k, (size_t)a * sizeof(double));
+        memcpy(g + a * i, sum + route.padded * a, (size_t)a * sizeof(double));
+    }
+}
+
+/* Blocks (l, a, a) of the sums of l pairs of cameras, rows for the one with the lower number. */
+void eg_bundle_pair_blocks(
+    const eg_bundle *bundle, ptrdiff_t count, const double *pairs, double *blocks)
+{
+    const eg_route route = eg_route_of(bundle);
+    const ptrdiff_t a = route.tangent;
+    for (ptrdiff_t k = 0; k < count; ++k, pairs += route.pair_sums, blocks += a * a) {
+        for (ptrdiff_t i = 0; !route.factored && i < a; ++i)
+            memcpy(blocks + a * i, pairs + route.padded * i, (size_t)a * sizeof(double));
+        for (int p = 0; route.factored && p < 3; ++p)
+            for (int i = 0; i < 4; ++i)
+                for (int q = 0; q < 3; ++q)
+                    for (int l = 0; l < 4; ++l)
+                        blocks[ROWS * (4 * p + i) + 4 * q + l] =
+                            pairs[EG_ENTRY(9, 3 * p + q, moment_of[i][l])];
     }
 }
 
@@ -158,75 +119,6 @@ void eg_bundle_reduce(
             }
             for (int k = 0; row == column && k < BLOCK; ++k)
                 S[k] += U[BLOCK * row + k];
-        }
-    }
-}
-
-/* L of S = L L^T in place of S, a few block rows at a time, so that the rows before them are read
-   from memory less often. Returns 1 where S is not positive definite. */
-int eg_envelope_factor(const eg_envelope *envelope, double *S)
-{
-    const int32_t *first = envelope->first;
-    for (ptrdiff_t begin = 0, end; begin < envelope->n; begin = end) {
-        end = begin + GROUP < envelope->n ? begin + GROUP : envelope->n;
-        ptrdiff_t i = begin;
-        for (ptrdiff_t k = begin; k < end; ++k)
-            i = first[k] < i ? first[k] : i;
-        for (; i < end; ++i) {
-            const double *other = S + BLOCK * envelope->slot[i];
-            for (ptrdiff_t k = i > begin ? i : begin; k < end; ++k) {
-                if (i < first[k])
-                    continue;
-                const ptrdiff_t both = first[k] > first[i] ? first[k] : first[i];
-                double *panel = S + BLOCK * envelope->slot[k], *block = panel + BLOCK * (i - first[k]);
-                subtract_product(ROWS * (i - both), panel + BLOCK * (both - first[k]),
-                                 other + BLOCK * (both - first[i]), block);
-                if (i < k)
-                    divide_by_transposed(other + BLOCK * (i - first[i]), block);
-                else if (factor_block(block))
-                    return 1;
-            }
-        }
-    }
-    return 0;
-}
-
-/* x <- (L L^T)^-1 x for `count` vectors, one after the other. */
-void eg_envelope_solve(
-    const eg_envelope *envelope, const double *S, ptrdiff_t count, double *x)
-{
-    for (ptrdiff_t c = 0; c < count; ++c, x += ROWS * envelope->n) {
-        for (ptrdiff_t k = 0; k < envelope->n; ++k) {
-            const double *panel = S + BLOCK * envelope->slot[k];
-            const double *before = x + ROWS * envelope->first[k];
-            const ptrdiff_t columns = ROWS * (k - envelope->first[k]);
-            double *own = x + ROWS * k;
-            for (ptrdiff_t p = 0; p < columns; ++p)
-                subtract_multiple(before[p], panel + ROWS * p, own);
-            for (ptrdiff_t j = 0; j < ROWS; ++j) {
-                const double *column = panel + ROWS * (columns + j);
-                const double value = own[j] / column[j];
-                subtract_multiple(value, column, own);
-                own[j] = value;
-            }
-        }
-        for (ptrdiff_t k = envelope->n - 1; k >= 0; --k) {
-            const double *panel = S + BLOCK * envelope->slot[k];
-            double *before = x + ROWS * envelope->first[k], *own = x + ROWS * k;
-            const ptrdiff_t columns = ROWS * (k - envelope->first[k]);
-            for (ptrdiff_t j = ROWS - 1; j >= 0; --j) {
-                const double *column = panel + ROWS * (columns + j);
-                double rest = own[j];
-                for (ptrdiff_t r = j + 1; r < ROWS; ++r)
-                    rest -= column[r] * own[r];
-                own[j] = rest / column[j];
-            }
-            for (ptrdiff_t p = 0; p < columns; ++p) {
-                double sum = 0.0;
-                for (int r = 0; r < ROWS; ++r)
-                    sum += panel[ROWS * p + r] * own[r];
-                before[p] -= sum;
-            }
         }
     }
 }

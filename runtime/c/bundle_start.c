@@ -2,6 +2,8 @@
 #include <math.h>
 
 #include "bundle_chunk.h"
+#include "bundle_moments.h"
+#include "skyline.h"
 #include "small.h"
 
 /* Points of least algebraic error: the lines of sight's linear meeting, unit vectors. */
@@ -185,6 +187,7 @@ static double largest(ptrdiff_t n, const double *values, ptrdiff_t stride)
 /* Minimise from a camera, which is updated, by damping lambda I as epigauge.lm.minimize does. */
 static void resect(const resection *r, double ftol, int max_iter, double *P)
 {
+    static const eg_bundle one = {.n_views = 1, .model = -1};
     static const int32_t first[1] = {0};
     static const ptrdiff_t slot[2] = {0, 1};
     const eg_envelope alone = {1, first, slot};
@@ -192,7 +195,7 @@ static void resect(const resection *r, double ftol, int max_iter, double *P)
     double cost = resection_cost(r, P, sums), lam = 0.0;
     for (int iteration = 0; cost > 0.0 && cost < INFINITY;) {
         double after, norm = 0.0;
-        eg_bundle_camera_blocks(1, sums, N, depth, g);
+        eg_bundle_camera_blocks(&one, sums, N, depth, g);
         const double size = largest(12, N, 13);
         if (lam == 0.0)
             lam = 1e-3 * fmax(size, 1e-300);

@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "bundle.h"
+#include "skyline.h"
 
 /* step = -(N + lam W)^-1 g for cameras (n, 12), then points (m, 4), solved where W = I; energy =
    step^T W step. Cameras are in the order of the envelope, whose blocks are 12x12. Returns 1 where
@@ -31,7 +32,7 @@ int eg_bundle_step(
     const ptrdiff_t chunks = bundle->n_chunks;
     int status = 2;
     if (!eg_bundle_whiten(n, U, W_cameras, lam, part[ROOTS], part[WHITE]) &&
-        !eg_bundle_inverse_roots(m, V, W_points, lam, g_points, part[T], part[HALF])) {
+        !eg_bundle_inverse_roots(m, 4, V, W_points, 16, lam, g_points, part[T], part[HALF])) {
         status = eg_bundle_schur(bundle, 0, chunks, P, Q, part[T], part[HALF], envelope,
                                  part[PAIRS], part[ELIMINATED]);
     }
@@ -64,8 +65,8 @@ int eg_bundle_step(
         }
         status = eg_bundle_couple(bundle, 0, chunks, P, Q, part[T], step, 0, part[COUPLED], 0);
         if (!status)
-            *energy += eg_bundle_point_steps(m, part[T], part[HALF], part[COUPLED], W_points,
-                                             step + 12 * n);
+            *energy += eg_bundle_point_steps(m, 4, part[T], part[HALF], part[COUPLED],
+                                             W_points, 16, step + 12 * n);
     }
     free(whole);
     return status;

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._library import address
+from epigauge._native import function
 from epigauge.kernels import backend
-from epigauge.multi_view._native import function
 
 __all__ = ["scatter_constraints", "spread", "spreading_basis"]
 

@@ -276,6 +276,105 @@ def brown_observe():
 
 
 @cache
+def brown_sight():
+    # Formula: r = q - q_hat of a point in the camera brown, and the Jacobian of the image by the
+    # point.
+    # Inputs:  camera (23,), X (3,), q (2,)
+    # Outputs: r (2,), J_point (2, 3)
+    # Operations: 159, temporaries: 42.
+    camera = ca.SX.sym("camera", 23, 1)
+    R00 = camera[0, 0]
+    R01 = camera[1, 0]
+    R02 = camera[2, 0]
+    tx = camera[3, 0]
+    R10 = camera[4, 0]
+    R11 = camera[5, 0]
+    R12 = camera[6, 0]
+    ty = camera[7, 0]
+    R20 = camera[8, 0]
+    R21 = camera[9, 0]
+    R22 = camera[10, 0]
+    tz = camera[11, 0]
+    c = camera[12, 0]
+    x0 = camera[13, 0]
+    y0 = camera[14, 0]
+    A1 = camera[15, 0]
+    A2 = camera[16, 0]
+    A3 = camera[17, 0]
+    B1 = camera[18, 0]
+    B2 = camera[19, 0]
+    C1 = camera[20, 0]
+    C2 = camera[21, 0]
+    R0 = camera[22, 0]
+    X = ca.SX.sym("X", 3, 1)
+    X0 = X[0, 0]
+    X1 = X[1, 0]
+    X2 = X[2, 0]
+    q = ca.SX.sym("q", 2, 1)
+    q0 = q[0, 0]
+    q1 = q[1, 0]
+    t0 = C1*c
+    t1 = c*c
+    h0 = tx + R00*X0 + R01*X1 + R02*X2
+    h2 = tz + R20*X0 + R21*X1 + R22*X2
+    inverse_depth = 1.0/h2
+    u = h0*inverse_depth
+    t4 = t1*u*u
+    h1 = ty + R10*X0 + R11*X1 + R12*X2
+    v = h1*inverse_depth
+    t5 = t1*v*v
+    t6 = t4 + t5
+    t9 = t6*t6
+    t13 = 1.0 + A1*(t6 - R0*R0) + A2*(t9 - R0*R0*R0*R0) + A3*(t6*t6*t6 - R0*R0*R0*R0*R0*R0)
+    t14 = c*t13
+    t15 = C2*c
+    t2 = 2.0*t1
+    t18 = t2*v
+    t21 = B1*u
+    t10 = A3*t9
+    t3 = A1*t2
+    t7 = 4.0*A2*t1*t6
+    t8 = 6.0*t1
+    t11 = t3*u + t7*u + t10*t8*u
+    t12 = c*u
+    b00 = 6.0*B1*t1*u + 2.0*B2*t1*v - t0 - t14 - t11*t12
+    t22 = b00*inverse_depth
+    a00 = t22
+    t16 = t8*v
+    t17 = t10*t16 + t3*v + t7*v
+    t19 = B1*t18 + B2*t2*u
+    b01 = t19 - t15 - t12*t17
+    t23 = b01*inverse_depth
+    a01 = t23
+    a02 = -t22*u - t23*v
+    t20 = c*v
+    b10 = t19 - t11*t20
+    t24 = b10*inverse_depth
+    a10 = t24
+    b11 = B2*t16 + t2*t21 - t14 - t17*t20
+    t25 = b11*inverse_depth
+    a11 = t25
+    a12 = -t24*u - t25*v
+    r = ca.SX(2, 1)
+    r[0, 0] = q0 + t0*u + t14*u + t15*v - x0 - B1*(3.0*t4 + t5) - B2*t18*u
+    r[1, 0] = q1 + c*t13*v - y0 - B2*(t4 + 3.0*t5) - t18*t21
+    J_point = ca.SX(2, 3)
+    J_point[0, 0] = R00*a00 + R10*a01 + R20*a02
+    J_point[0, 1] = R01*a00 + R11*a01 + R21*a02
+    J_point[0, 2] = R02*a00 + R12*a01 + R22*a02
+    J_point[1, 0] = R00*a10 + R10*a11 + R20*a12
+    J_point[1, 1] = R01*a10 + R11*a11 + R21*a12
+    J_point[1, 2] = R02*a10 + R12*a11 + R22*a12
+    return ca.Function(
+        "brown_sight",
+        [camera, X, q],
+        [r, J_point],
+        ["camera", "X", "q"],
+        ["r", "J_point"],
+    )
+
+
+@cache
 def brown_retract():
     # Formula: brown camera moved by an update (wx, wy, wz, dx, dy, dz, c, x0, y0, A1, A2, A3,
     # B1, B2, C1, C2).

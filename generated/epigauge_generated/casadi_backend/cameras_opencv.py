@@ -240,6 +240,94 @@ def opencv_observe():
 
 
 @cache
+def opencv_sight():
+    # Formula: r = q - q_hat of a point in the camera OPENCV, and the Jacobian of the image by
+    # the point.
+    # Inputs:  camera (20,), X (3,), q (2,)
+    # Outputs: r (2,), J_point (2, 3)
+    # Operations: 125, temporaries: 34.
+    camera = ca.SX.sym("camera", 20, 1)
+    R00 = camera[0, 0]
+    R01 = camera[1, 0]
+    R02 = camera[2, 0]
+    tx = camera[3, 0]
+    R10 = camera[4, 0]
+    R11 = camera[5, 0]
+    R12 = camera[6, 0]
+    ty = camera[7, 0]
+    R20 = camera[8, 0]
+    R21 = camera[9, 0]
+    R22 = camera[10, 0]
+    tz = camera[11, 0]
+    fx = camera[12, 0]
+    fy = camera[13, 0]
+    cx = camera[14, 0]
+    cy = camera[15, 0]
+    k1 = camera[16, 0]
+    k2 = camera[17, 0]
+    p1 = camera[18, 0]
+    p2 = camera[19, 0]
+    X = ca.SX.sym("X", 3, 1)
+    X0 = X[0, 0]
+    X1 = X[1, 0]
+    X2 = X[2, 0]
+    q = ca.SX.sym("q", 2, 1)
+    q0 = q[0, 0]
+    q1 = q[1, 0]
+    h0 = tx + R00*X0 + R01*X1 + R02*X2
+    h2 = tz + R20*X0 + R21*X1 + R22*X2
+    inverse_depth = 1.0/h2
+    u = h0*inverse_depth
+    t0 = u*u
+    h1 = ty + R10*X0 + R11*X1 + R12*X2
+    v = h1*inverse_depth
+    t1 = v*v
+    t2 = t0 + t1
+    t3 = k2*t2
+    t4 = k1 + t3
+    t10 = 1.0 + t2*t4
+    t7 = 2.0*p1
+    t8 = t7*v
+    t11 = 2.0*v
+    t9 = p2*u
+    t5 = 2.0*t4
+    t6 = 2.0*t3*u + t5*u
+    b00 = fx*(t10 + t8 + 6.0*t9 + t6*u)
+    t14 = b00*inverse_depth
+    a00 = t14
+    t12 = t11*t3 + t5*v
+    t13 = p2*t11 + t7*u
+    b01 = fx*(t13 + t12*u)
+    t15 = b01*inverse_depth
+    a01 = t15
+    a02 = -t14*u - t15*v
+    b10 = fy*(t13 + t6*v)
+    t16 = b10*inverse_depth
+    a10 = t16
+    b11 = fy*(t10 + 2.0*t9 + 6.0*p1*v + t12*v)
+    t17 = b11*inverse_depth
+    a11 = t17
+    a12 = -t16*u - t17*v
+    r = ca.SX(2, 1)
+    r[0, 0] = q0 - cx - fx*(p2*(3.0*t0 + t1) + t10*u + t8*u)
+    r[1, 0] = q1 - cy - fy*(p1*(t0 + 3.0*t1) + t10*v + t11*t9)
+    J_point = ca.SX(2, 3)
+    J_point[0, 0] = R00*a00 + R10*a01 + R20*a02
+    J_point[0, 1] = R01*a00 + R11*a01 + R21*a02
+    J_point[0, 2] = R02*a00 + R12*a01 + R22*a02
+    J_point[1, 0] = R00*a10 + R10*a11 + R20*a12
+    J_point[1, 1] = R01*a10 + R11*a11 + R21*a12
+    J_point[1, 2] = R02*a10 + R12*a11 + R22*a12
+    return ca.Function(
+        "opencv_sight",
+        [camera, X, q],
+        [r, J_point],
+        ["camera", "X", "q"],
+        ["r", "J_point"],
+    )
+
+
+@cache
 def opencv_retract():
     # Formula: OPENCV camera moved by an update (wx, wy, wz, dx, dy, dz, fx, fy, cx, cy, k1, k2,
     # p1, p2).

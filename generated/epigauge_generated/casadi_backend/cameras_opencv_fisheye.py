@@ -251,6 +251,116 @@ def opencv_fisheye_observe():
 
 
 @cache
+def opencv_fisheye_sight():
+    # Formula: r = q - q_hat of a point in the camera OPENCV_FISHEYE, and the Jacobian of the
+    # image by the point.
+    # Inputs:  camera (20,), X (3,), q (2,)
+    # Outputs: r (2,), J_point (2, 3)
+    # Operations: 178, temporaries: 56.
+    camera = ca.SX.sym("camera", 20, 1)
+    R00 = camera[0, 0]
+    R01 = camera[1, 0]
+    R02 = camera[2, 0]
+    tx = camera[3, 0]
+    R10 = camera[4, 0]
+    R11 = camera[5, 0]
+    R12 = camera[6, 0]
+    ty = camera[7, 0]
+    R20 = camera[8, 0]
+    R21 = camera[9, 0]
+    R22 = camera[10, 0]
+    tz = camera[11, 0]
+    fx = camera[12, 0]
+    fy = camera[13, 0]
+    cx = camera[14, 0]
+    cy = camera[15, 0]
+    k1 = camera[16, 0]
+    k2 = camera[17, 0]
+    k3 = camera[18, 0]
+    k4 = camera[19, 0]
+    X = ca.SX.sym("X", 3, 1)
+    X0 = X[0, 0]
+    X1 = X[1, 0]
+    X2 = X[2, 0]
+    q = ca.SX.sym("q", 2, 1)
+    q0 = q[0, 0]
+    q1 = q[1, 0]
+    h0 = tx + R00*X0 + R01*X1 + R02*X2
+    h2 = tz + R20*X0 + R21*X1 + R22*X2
+    t0 = h2*h2
+    t1 = 1e-40*t0
+    t2 = h0*h0
+    h1 = ty + R10*X0 + R11*X1 + R12*X2
+    t3 = h1*h1
+    t4 = t2 + t3
+    t5 = t1 + t4
+    t6 = ca.sqrt(t5)
+    t7 = ca.atan2(t6, h2)
+    t10 = t7*t7
+    t11 = k3 + k4*t10
+    t12 = k2 + t10*t11
+    t13 = k1 + t10*t12
+    t14 = 1.0 + t10*t13
+    t15 = fx*t14
+    t8 = 1.0/t6
+    t9 = t7*t8
+    t16 = t15*t9
+    t44 = fy*t9
+    t46 = t14*t44
+    t17 = t15*t2
+    t18 = 1.0/(1.0*t0 + t4)
+    t19 = h2*t18
+    t20 = t19/t5
+    t21 = t7/(t5*ca.sqrt(t5))
+    t22 = h0*t9
+    t23 = 2.0*t19
+    t24 = t22*t23
+    t25 = k4*t7*t7*t7
+    t26 = t18*t8
+    t27 = 2.0*h2*t25*t26
+    t28 = t10*(t10*(h0*t27 + t11*t24) + t12*t24) + t13*t24
+    t29 = fx*t22
+    a00 = t16 + t17*t20 + t28*t29 - t17*t21
+    t30 = h0*t15
+    t31 = h1*t30
+    t32 = h1*t23*t9
+    t33 = t10*(t10*(h1*t27 + t11*t32) + t12*t32) + t13*t32
+    a01 = t20*t31 + t29*t33 - t21*t31
+    t34 = 1e-40*h2
+    t35 = t18*t6
+    t36 = t8*(t1*t26 - t35)
+    t37 = 2e-40*t0*t26 - 2.0*t35
+    t38 = t37*t7
+    t39 = t10*(t10*(t11*t38 + t25*t37) + t12*t38) + t13*t38
+    a02 = t29*t39 + t30*t36 - t21*t30*t34
+    t40 = fy*t14
+    t41 = h1*t40
+    t42 = t21*t40
+    t43 = h1*t42
+    t45 = h1*t44
+    a10 = t28*t45 + h0*t20*t41 - h0*t43
+    a11 = t46 + t33*t45 + t20*t3*t40 - t3*t42
+    a12 = t36*t41 + t39*t45 - t34*t43
+    r = ca.SX(2, 1)
+    r[0, 0] = q0 - cx - h0*t16
+    r[1, 0] = q1 - cy - h1*t46
+    J_point = ca.SX(2, 3)
+    J_point[0, 0] = R00*a00 + R10*a01 + R20*a02
+    J_point[0, 1] = R01*a00 + R11*a01 + R21*a02
+    J_point[0, 2] = R02*a00 + R12*a01 + R22*a02
+    J_point[1, 0] = R00*a10 + R10*a11 + R20*a12
+    J_point[1, 1] = R01*a10 + R11*a11 + R21*a12
+    J_point[1, 2] = R02*a10 + R12*a11 + R22*a12
+    return ca.Function(
+        "opencv_fisheye_sight",
+        [camera, X, q],
+        [r, J_point],
+        ["camera", "X", "q"],
+        ["r", "J_point"],
+    )
+
+
+@cache
 def opencv_fisheye_retract():
     # Formula: OPENCV_FISHEYE camera moved by an update (wx, wy, wz, dx, dy, dz, fx, fy, cx, cy,
     # k1, k2, k3, k4).

@@ -178,6 +178,68 @@ def pinhole_observe():
 
 
 @cache
+def pinhole_sight():
+    # Formula: r = q - q_hat of a point in the camera PINHOLE, and the Jacobian of the image by
+    # the point.
+    # Inputs:  camera (16,), X (3,), q (2,)
+    # Outputs: r (2,), J_point (2, 3)
+    # Operations: 51, temporaries: 12.
+    camera = ca.SX.sym("camera", 16, 1)
+    R00 = camera[0, 0]
+    R01 = camera[1, 0]
+    R02 = camera[2, 0]
+    tx = camera[3, 0]
+    R10 = camera[4, 0]
+    R11 = camera[5, 0]
+    R12 = camera[6, 0]
+    ty = camera[7, 0]
+    R20 = camera[8, 0]
+    R21 = camera[9, 0]
+    R22 = camera[10, 0]
+    tz = camera[11, 0]
+    fx = camera[12, 0]
+    fy = camera[13, 0]
+    cx = camera[14, 0]
+    cy = camera[15, 0]
+    X = ca.SX.sym("X", 3, 1)
+    X0 = X[0, 0]
+    X1 = X[1, 0]
+    X2 = X[2, 0]
+    q = ca.SX.sym("q", 2, 1)
+    q0 = q[0, 0]
+    q1 = q[1, 0]
+    h0 = tx + R00*X0 + R01*X1 + R02*X2
+    h2 = tz + R20*X0 + R21*X1 + R22*X2
+    inverse_depth = 1.0/h2
+    u = h0*inverse_depth
+    h1 = ty + R10*X0 + R11*X1 + R12*X2
+    v = h1*inverse_depth
+    t0 = fx*inverse_depth
+    a00 = t0
+    a02 = -t0*u
+    t1 = fy*inverse_depth
+    a11 = t1
+    a12 = -t1*v
+    r = ca.SX(2, 1)
+    r[0, 0] = q0 - cx - fx*u
+    r[1, 0] = q1 - cy - fy*v
+    J_point = ca.SX(2, 3)
+    J_point[0, 0] = R00*a00 + R20*a02
+    J_point[0, 1] = R01*a00 + R21*a02
+    J_point[0, 2] = R02*a00 + R22*a02
+    J_point[1, 0] = R10*a11 + R20*a12
+    J_point[1, 1] = R11*a11 + R21*a12
+    J_point[1, 2] = R12*a11 + R22*a12
+    return ca.Function(
+        "pinhole_sight",
+        [camera, X, q],
+        [r, J_point],
+        ["camera", "X", "q"],
+        ["r", "J_point"],
+    )
+
+
+@cache
 def pinhole_retract():
     # Formula: PINHOLE camera moved by an update (wx, wy, wz, dx, dy, dz, fx, fy, cx, cy).
     # Inputs:  camera (16,), delta (10,)

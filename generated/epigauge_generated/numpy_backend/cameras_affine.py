@@ -112,6 +112,42 @@ def affine_observe(camera, X, q, r, J_camera, J_point):
     J_point[1, 2] = P12
 
 
+def affine_sight(camera, X, q, r, J_point):
+    # Formula: r = q - q_hat of a point in the camera affine, and the Jacobian of the image by
+    # the point.
+    # Inputs:  camera (12,), X (3,), q (2,)
+    # Outputs: r (2,), J_point (2, 3)
+    # Operations: 20, temporaries: 3.
+    P00 = camera[0]
+    P01 = camera[1]
+    P02 = camera[2]
+    P03 = camera[3]
+    P10 = camera[4]
+    P11 = camera[5]
+    P12 = camera[6]
+    P13 = camera[7]
+    P20 = camera[8]
+    P21 = camera[9]
+    P22 = camera[10]
+    P23 = camera[11]
+    X0 = X[0]
+    X1 = X[1]
+    X2 = X[2]
+    q0 = q[0]
+    q1 = q[1]
+    h0 = P03 + P00*X0 + P01*X1 + P02*X2
+    h1 = P13 + P10*X0 + P11*X1 + P12*X2
+    h2 = P23 + P20*X0 + P21*X1 + P22*X2
+    r[0] = q0 - h0
+    r[1] = q1 - h1
+    J_point[0, 0] = P00
+    J_point[0, 1] = P01
+    J_point[0, 2] = P02
+    J_point[1, 0] = P10
+    J_point[1, 1] = P11
+    J_point[1, 2] = P12
+
+
 def affine_retract(camera, delta, moved):
     # Formula: affine camera moved by an update (dP00, dP01, dP02, dP03, dP10, dP11, dP12, dP13).
     # Inputs:  camera (12,), delta (8,)

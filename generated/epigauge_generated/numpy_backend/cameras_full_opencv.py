@@ -242,6 +242,99 @@ def full_opencv_observe(camera, X, q, r, J_camera, J_point):
     J_point[1, 2] = R02*a10 + R12*a11 + R22*a12
 
 
+def full_opencv_sight(camera, X, q, r, J_point):
+    # Formula: r = q - q_hat of a point in the camera FULL_OPENCV, and the Jacobian of the image
+    # by the point.
+    # Inputs:  camera (24,), X (3,), q (2,)
+    # Outputs: r (2,), J_point (2, 3)
+    # Operations: 168, temporaries: 48.
+    R00 = camera[0]
+    R01 = camera[1]
+    R02 = camera[2]
+    tx = camera[3]
+    R10 = camera[4]
+    R11 = camera[5]
+    R12 = camera[6]
+    ty = camera[7]
+    R20 = camera[8]
+    R21 = camera[9]
+    R22 = camera[10]
+    tz = camera[11]
+    fx = camera[12]
+    fy = camera[13]
+    cx = camera[14]
+    cy = camera[15]
+    k1 = camera[16]
+    k2 = camera[17]
+    p1 = camera[18]
+    p2 = camera[19]
+    k3 = camera[20]
+    k4 = camera[21]
+    k5 = camera[22]
+    k6 = camera[23]
+    X0 = X[0]
+    X1 = X[1]
+    X2 = X[2]
+    q0 = q[0]
+    q1 = q[1]
+    t0 = 2.0*p1
+    h1 = ty + R10*X0 + R11*X1 + R12*X2
+    h2 = tz + R20*X0 + R21*X1 + R22*X2
+    inverse_depth = 1.0/h2
+    v = h1*inverse_depth
+    t1 = t0*v
+    h0 = tx + R00*X0 + R01*X1 + R02*X2
+    u = h0*inverse_depth
+    t3 = u*u
+    t4 = v*v
+    t5 = t3 + t4
+    t10 = k6*t5
+    t11 = k5 + t10
+    t12 = k4 + t11*t5
+    t13 = 1.0 + t12*t5
+    t14 = 1.0/t13
+    t6 = k3*t5
+    t7 = k2 + t6
+    t8 = k1 + t5*t7
+    t9 = 1.0 + t5*t8
+    t15 = t14*t9
+    t2 = p2*u
+    t22 = 2.0*v
+    t16 = 2.0*u
+    t17 = t16*t8 + t5*(t16*t6 + t16*t7)
+    t18 = t14*u
+    t19 = -t12*t16 - t5*(t10*t16 + t11*t16)
+    t20 = t9/(t13*t13)
+    t21 = t20*u
+    b00 = fx*(t1 + t15 + 6.0*t2 + t17*t18 + t19*t21)
+    t28 = b00*inverse_depth
+    a00 = t28
+    t23 = t22*t8 + t5*(t22*t6 + t22*t7)
+    t24 = -t12*t22 - t5*(t10*t22 + t11*t22)
+    t25 = p2*t22 + t0*u
+    b01 = fx*(t25 + t18*t23 + t21*t24)
+    t29 = b01*inverse_depth
+    a01 = t29
+    a02 = -t28*u - t29*v
+    t26 = t14*v
+    t27 = t20*v
+    b10 = fy*(t25 + t17*t26 + t19*t27)
+    t30 = b10*inverse_depth
+    a10 = t30
+    b11 = fy*(t15 + 2.0*t2 + 6.0*p1*v + t23*t26 + t24*t27)
+    t31 = b11*inverse_depth
+    a11 = t31
+    a12 = -t30*u - t31*v
+    r[0] = q0 - cx - fx*(p2*(3.0*t3 + t4) + t1*u + t15*u)
+    r[1] = q1 - cy - fy*(p1*(t3 + 3.0*t4) + t15*v + t2*t22)
+    J_point[0, 0] = R00*a00 + R10*a01 + R20*a02
+    J_point[0, 1] = R01*a00 + R11*a01 + R21*a02
+    J_point[0, 2] = R02*a00 + R12*a01 + R22*a02
+    J_point[1, 0] = R00*a10 + R10*a11 + R20*a12
+    J_point[1, 1] = R01*a10 + R11*a11 + R21*a12
+    J_point[1, 2] = R02*a10 + R12*a11 + R22*a12
+
+
 def full_opencv_retract(camera, delta, moved):
     # Formula: FULL_OPENCV camera moved by an update (wx, wy, wz, dx, dy, dz, fx, fy, cx, cy, k1,
     # k2, p1, p2, k3, k4, k5, k6).

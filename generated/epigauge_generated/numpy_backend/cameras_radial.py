@@ -172,6 +172,74 @@ def radial_observe(camera, X, q, r, J_camera, J_point):
     J_point[1, 2] = R02*a10 + R12*a11 + R22*a12
 
 
+def radial_sight(camera, X, q, r, J_point):
+    # Formula: r = q - q_hat of a point in the camera RADIAL, and the Jacobian of the image by
+    # the point.
+    # Inputs:  camera (17,), X (3,), q (2,)
+    # Outputs: r (2,), J_point (2, 3)
+    # Operations: 93, temporaries: 30.
+    R00 = camera[0]
+    R01 = camera[1]
+    R02 = camera[2]
+    tx = camera[3]
+    R10 = camera[4]
+    R11 = camera[5]
+    R12 = camera[6]
+    ty = camera[7]
+    R20 = camera[8]
+    R21 = camera[9]
+    R22 = camera[10]
+    tz = camera[11]
+    f = camera[12]
+    cx = camera[13]
+    cy = camera[14]
+    k1 = camera[15]
+    k2 = camera[16]
+    X0 = X[0]
+    X1 = X[1]
+    X2 = X[2]
+    q0 = q[0]
+    q1 = q[1]
+    h0 = tx + R00*X0 + R01*X1 + R02*X2
+    h2 = tz + R20*X0 + R21*X1 + R22*X2
+    inverse_depth = 1.0/h2
+    u = h0*inverse_depth
+    h1 = ty + R10*X0 + R11*X1 + R12*X2
+    v = h1*inverse_depth
+    t0 = u*u + v*v
+    t1 = k2*t0
+    t2 = k1 + t1
+    t3 = f*(1.0 + t0*t2)
+    t4 = 2.0*t1
+    t5 = 2.0*t2
+    t6 = t4*u + t5*u
+    t7 = f*u
+    b00 = t3 + t6*t7
+    t10 = b00*inverse_depth
+    a00 = t10
+    t8 = t4*v + t5*v
+    b01 = t7*t8
+    t11 = b01*inverse_depth
+    a01 = t11
+    a02 = -t10*u - t11*v
+    t9 = f*v
+    b10 = t6*t9
+    t12 = b10*inverse_depth
+    a10 = t12
+    b11 = t3 + t8*t9
+    t13 = b11*inverse_depth
+    a11 = t13
+    a12 = -t12*u - t13*v
+    r[0] = q0 - cx - t3*u
+    r[1] = q1 - cy - t3*v
+    J_point[0, 0] = R00*a00 + R10*a01 + R20*a02
+    J_point[0, 1] = R01*a00 + R11*a01 + R21*a02
+    J_point[0, 2] = R02*a00 + R12*a01 + R22*a02
+    J_point[1, 0] = R00*a10 + R10*a11 + R20*a12
+    J_point[1, 1] = R01*a10 + R11*a11 + R21*a12
+    J_point[1, 2] = R02*a10 + R12*a11 + R22*a12
+
+
 def radial_retract(camera, delta, moved):
     # Formula: RADIAL camera moved by an update (wx, wy, wz, dx, dy, dz, f, cx, cy, k1, k2).
     # Inputs:  camera (17,), delta (11,)

@@ -161,6 +161,68 @@ def simple_radial_observe(camera, X, q, r, J_camera, J_point):
     J_point[1, 2] = R02*a10 + R12*a11 + R22*a12
 
 
+def simple_radial_sight(camera, X, q, r, J_point):
+    # Formula: r = q - q_hat of a point in the camera SIMPLE_RADIAL, and the Jacobian of the
+    # image by the point.
+    # Inputs:  camera (16,), X (3,), q (2,)
+    # Outputs: r (2,), J_point (2, 3)
+    # Operations: 83, temporaries: 25.
+    R00 = camera[0]
+    R01 = camera[1]
+    R02 = camera[2]
+    tx = camera[3]
+    R10 = camera[4]
+    R11 = camera[5]
+    R12 = camera[6]
+    ty = camera[7]
+    R20 = camera[8]
+    R21 = camera[9]
+    R22 = camera[10]
+    tz = camera[11]
+    f = camera[12]
+    cx = camera[13]
+    cy = camera[14]
+    k = camera[15]
+    X0 = X[0]
+    X1 = X[1]
+    X2 = X[2]
+    q0 = q[0]
+    q1 = q[1]
+    h0 = tx + R00*X0 + R01*X1 + R02*X2
+    h2 = tz + R20*X0 + R21*X1 + R22*X2
+    inverse_depth = 1.0/h2
+    u = h0*inverse_depth
+    t0 = u*u
+    h1 = ty + R10*X0 + R11*X1 + R12*X2
+    v = h1*inverse_depth
+    t2 = v*v
+    t3 = f*(1.0 + k*(t0 + t2))
+    t1 = 2.0*f*k
+    b00 = t3 + t0*t1
+    t5 = b00*inverse_depth
+    a00 = t5
+    t4 = t1*u*v
+    b01 = t4
+    t6 = b01*inverse_depth
+    a01 = t6
+    a02 = -t5*u - t6*v
+    b10 = t4
+    t7 = b10*inverse_depth
+    a10 = t7
+    b11 = t3 + t1*t2
+    t8 = b11*inverse_depth
+    a11 = t8
+    a12 = -t7*u - t8*v
+    r[0] = q0 - cx - t3*u
+    r[1] = q1 - cy - t3*v
+    J_point[0, 0] = R00*a00 + R10*a01 + R20*a02
+    J_point[0, 1] = R01*a00 + R11*a01 + R21*a02
+    J_point[0, 2] = R02*a00 + R12*a01 + R22*a02
+    J_point[1, 0] = R00*a10 + R10*a11 + R20*a12
+    J_point[1, 1] = R01*a10 + R11*a11 + R21*a12
+    J_point[1, 2] = R02*a10 + R12*a11 + R22*a12
+
+
 def simple_radial_retract(camera, delta, moved):
     # Formula: SIMPLE_RADIAL camera moved by an update (wx, wy, wz, dx, dy, dz, f, cx, cy, k).
     # Inputs:  camera (16,), delta (10,)

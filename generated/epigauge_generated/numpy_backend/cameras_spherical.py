@@ -131,6 +131,57 @@ def spherical_observe(camera, X, q, r, J_camera, J_point):
     J_point[1, 2] = R02*a10 + R12*a11 + R22*a12
 
 
+def spherical_sight(camera, X, q, r, J_point):
+    # Formula: r = q - q_hat of a point in the camera spherical, and the Jacobian of the image by
+    # the point.
+    # Inputs:  camera (14,), X (3,), q (2,)
+    # Outputs: r (2,), J_point (2, 3)
+    # Operations: 84, temporaries: 16.
+    R00 = camera[0]
+    R01 = camera[1]
+    R02 = camera[2]
+    tx = camera[3]
+    R10 = camera[4]
+    R11 = camera[5]
+    R12 = camera[6]
+    ty = camera[7]
+    R20 = camera[8]
+    R21 = camera[9]
+    R22 = camera[10]
+    tz = camera[11]
+    width = camera[12]
+    height = camera[13]
+    X0 = X[0]
+    X1 = X[1]
+    X2 = X[2]
+    q0 = q[0]
+    q1 = q[1]
+    h0 = tx + R00*X0 + R01*X1 + R02*X2
+    h2 = tz + R20*X0 + R21*X1 + R22*X2
+    t1 = 1.0/3.141592653589793
+    t2 = 0.5*t1
+    t7 = width*(0.5 + t2*np.arctan2(h0, h2))
+    h1 = ty + R10*X0 + R11*X1 + R12*X2
+    t0 = h0*h0 + h2*h2
+    t4 = np.sqrt(t0)
+    t3 = t2*width/t0
+    a00 = h2*t3
+    a02 = -h0*t3
+    t5 = height*t1/(h1*h1 + t0)
+    t6 = h1*t5/t4
+    a10 = -h0*t6
+    a11 = t4*t5
+    a12 = -h2*t6
+    r[0] = q0 - t7 - width*np.floor(0.5 + (q0 - t7)/width)
+    r[1] = q1 - height*(0.5 + t1*np.arctan2(h1, t4))
+    J_point[0, 0] = R00*a00 + R20*a02
+    J_point[0, 1] = R01*a00 + R21*a02
+    J_point[0, 2] = R02*a00 + R22*a02
+    J_point[1, 0] = R00*a10 + R10*a11 + R20*a12
+    J_point[1, 1] = R01*a10 + R11*a11 + R21*a12
+    J_point[1, 2] = R02*a10 + R12*a11 + R22*a12
+
+
 def spherical_retract(camera, delta, moved):
     # Formula: spherical camera moved by an update (wx, wy, wz, dx, dy, dz).
     # Inputs:  camera (14,), delta (6,)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._library import address
-from epigauge.multi_view._native import function
+from epigauge._native import function
 
 __all__ = ["Envelope", "narrow"]
 

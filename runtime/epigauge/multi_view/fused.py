@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._library import address
-from epigauge.multi_view._native import CAMERA, aligned_zeros, checked, function
+from epigauge._native import CAMERA, Refinement, aligned_zeros, checked, function
 from epigauge.multi_view.coupling import most_blocks
 from epigauge.multi_view.engine import Normal, Triangulation
 from epigauge.multi_view.envelope import Envelope
@@ -180,7 +180,8 @@ class Fused:
         before = tuple(map(address, (P, Q, V, D, g)))
         (sums,) = self.summed("bundle_linearize", before, (n, CAMERA))
         U, depths, g_cameras = np.empty((n, 12, 12)), np.empty((n, 12, 12)), np.empty((n, 12))
-        function("bundle_camera_blocks")(n, *map(address, (sums, U, depths, g_cameras)))
+        blocks = map(address, (sums, U, depths, g_cameras))
+        function("bundle_camera_blocks")(self.reference, *blocks)
         U, depths, g_cameras = map(self.outward, (U, depths, g_cameras))
         return Normal(U, V, FusedCoupling(self, P, Q), g_cameras, g, (depths, D))
 
@@ -193,6 +194,7 @@ class Fused:
     def triangulated(self, P: Array, Q: Array, how: Triangulation) -> tuple[Array, Array]:
         """Return the points moved to where their own observations want them, and their costs."""
         costs, P, Q = np.empty(len(Q)), self.inward(P), np.array(Q, order="C")
-        options = (how.iterations, how.lam, how.factor, how.tolerance)
-        self.each("bundle_triangulate", address(P), address(Q), address(costs), *options)
+        options = Refinement(how.iterations, 0, how.lam, how.factor, how.tolerance)
+        arrays = map(address, (P, Q, costs, None))
+        self.each("bundle_refine_points", *arrays, ctypes.addressof(options))
         return Q, costs

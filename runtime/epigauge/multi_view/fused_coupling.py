@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._library import address
+from epigauge._native import PAIR, checked, function
 from epigauge.kernels import table
-from epigauge.multi_view._native import PAIR, checked, function
 from epigauge.multi_view.coupling import solved
 from epigauge.multi_view.engine import Reference
 from epigauge.multi_view.envelope import Envelope
@@ -132,10 +132,9 @@ class FusedCoupling:
         y = step[12 * n :].reshape(m, 4)
 
         def moved(part: slice) -> float:
-            arrays = (array[part] for array in (T, half, coupled, W_points, y))
-            return float(
-                function("bundle_point_steps")(part.stop - part.start, *map(address, arrays))
-            )
+            arrays = [address(array[part]) for array in (T, half, coupled, W_points)]
+            count = part.stop - part.start
+            return float(function("bundle_point_steps")(count, 4, *arrays, 16, address(y[part])))
 
         return step, sum(own.over_points(moved)) + float(np.vdot(z, z))
 
@@ -279,7 +278,9 @@ def _root_points(
 ) -> bool:
     """Make T with T T^T = (V + lam W)^-1, V^-1 without W, and half = T^T g; tell of failure."""
     arrays = map(address, (g, T, half))
-    return bool(function("bundle_inverse_roots")(len(V), address(V), address(W), lam, *arrays))
+    return bool(
+        function("bundle_inverse_roots")(len(V), 4, address(V), address(W), 16, lam, *arrays)
+    )
 
 
 def _singular(what: str) -> np.linalg.LinAlgError:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._library import address
-from epigauge.multi_view._native import LANES, Bundle, function
+from epigauge._native import FACTORED, LANES, Bundle, function
 from epigauge.multi_view.engine import LEAST_WEIGHT
 from epigauge.multi_view.envelope import Envelope, narrow
 from epigauge.multi_view.layout import Layout
@@ -64,6 +64,8 @@ class Packed:
             len(self.lanes) - 1,
             *map(address, arrays),
             least=LEAST_WEIGHT * float(weights.max()),
+            model=FACTORED,
+            width=12,
         )
         self._pack(layout.view, q, weights)
 

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from epigauge import lm
 from epigauge._library import address
+from epigauge._native import function
 from epigauge.kernels import Table
 from epigauge.linear import Dense, Levenberg
-from epigauge.multi_view._native import function
 from epigauge.scatter import spread
 from epigauge.two_view.losses import EFFICIENT, Loss, robust_scale
 
@@ -25,7 +25,7 @@ _ROUNDS, _STEADY = 5, 1e-8
 _STOPPING = lm.Stopping(ftol=1e-6)
 
 
-def resect(kernels: Table, q: Array, Q: Array, start: Array | None = None) -> Array:
+def resect(kernels: Table, q: Array, Q: Array) -> Array:
     """Return the camera that projects points to measurements: linear, then robustly refined.
 
     Parameters
@@ -34,8 +34,6 @@ def resect(kernels: Table, q: Array, Q: Array, start: Array | None = None) -> Ar
         Backend.
     q, Q : ndarray, shape (2, c), (4, c)
         At least six measurements and points.
-    start : ndarray, shape (3, 4), optional
-        What to refine; by default the camera of least algebraic error.
 
     Returns
     -------
@@ -44,7 +42,7 @@ def resect(kernels: Table, q: Array, Q: Array, start: Array | None = None) -> Ar
     """
     minimized = _minimized_in_c if kernels.name == "c" else _minimized
     q, Q = np.ascontiguousarray(q), np.ascontiguousarray(Q)
-    P = _linear_camera(q, Q) if start is None else start
+    P = _linear_camera(q, Q)
     for _ in range(_ROUNDS):
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             h = P @ Q

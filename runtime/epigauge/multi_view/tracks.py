@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -164,24 +163,6 @@ class Tracks:
         tracks = cls(new_views, new_points, pixels[keep], weights=w[keep])
         return tracks, all_views[old_views], all_points[old_points]
 
-    def weighted(self, weights: ArrayLike) -> Tracks:
-        """Return the same observations with other weights.
-
-        Parameters
-        ----------
-        weights : array_like, shape (N,)
-            Factor of each squared residual, in the order of the tracks (not of their input).
-
-        Returns
-        -------
-        Tracks
-            All else is shared.
-        """
-        other = copy.copy(self)
-        other.weights = as_weights(weights, len(self)).copy()
-        other.weights.setflags(write=False)
-        return other
-
     def __len__(self) -> int:
         """Return the number of observations."""
         return len(self.view)
@@ -323,12 +304,10 @@ class Reconstruction:
         Returns
         -------
         float
-            sqrt(sum of squared residual coordinates / (2 N)), in pixels, of the N observations
-            whose weight is not zero.
+            sqrt(sum of squared residual coordinates / (2 N)), in pixels.
         """
-        counts = tracks.weights > 0.0
         with np.errstate(over="ignore"):
-            return float(np.sqrt(np.mean((tracks.xy - self.project(tracks))[counts] ** 2)))
+            return float(np.sqrt(np.mean((tracks.xy - self.project(tracks)) ** 2)))
 
 
 def _homogeneous(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:

@@ -1,4 +1,4 @@
-"""The functions of runtime/c/bundle*.c as ctypes calls them."""
+"""The functions of runtime/c as ctypes calls them, and the structures it shares with Python."""
 
 from __future__ import annotations
 
@@ -13,10 +13,17 @@ from numpy.typing import NDArray
 from epigauge._library import address, library
 
 __all__ = [
+    "BLOCK",
     "CAMERA",
+    "FACTORED",
     "LANES",
+    "MOST_TANGENT",
     "PAIR",
+    "PANEL",
+    "TRACE",
     "Bundle",
+    "Envelope",
+    "Refinement",
     "aligned_zeros",
     "checked",
     "function",
@@ -26,6 +33,9 @@ Array = NDArray[np.float64]
 
 #: As in bundle.h.
 LANES, CAMERA, PAIR = 8, 96, 112
+
+#: Rows of a panel, as in panels.h, and the widest tangent of a camera, as in skyline.h.
+PANEL, MOST_TANGENT = 12, 32
 
 _P, _N, _D, _I = ctypes.c_void_p, ctypes.c_ssize_t, ctypes.c_double, ctypes.c_int
 
@@ -47,21 +57,53 @@ class Bundle(ctypes.Structure):
         ("least", _D),
         ("scale2", _D),
         ("loss", _N),
+        ("model", _N),
+        ("width", _N),
+        ("columns", _P),
     )
+
+
+#: The model of projective cameras by the factors of their Jacobian.
+FACTORED = -1
+
+
+class Envelope(ctypes.Structure):
+    """The eg_envelope of skyline.h."""
+
+    _fields_ = (("n", _N), ("first", _P), ("slot", _P))
+
+
+class Refinement(ctypes.Structure):
+    """The eg_refinement of bundle.h."""
+
+    _fields_ = (
+        ("iterations", _N),
+        ("damping", _N),
+        ("lam", _D),
+        ("factor", _D),
+        ("tolerance", _D),
+    )
+
+
+#: The damping of a refinement: by the trace of a point's block, or by the block.
+TRACE, BLOCK = 0, 1
 
 
 #: Results and arguments. The first three of most are the bundle and a range of its chunks.
 _RANGE = (_P, _N, _N)
 _TYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "bundle_pack": (None, (_P,) * 8),
+    "camera_model_row": (_N, (ctypes.c_char_p,)),
+    "bundle_widths": (None, (_P, _P)),
     "bundle_costs": (_I, (*_RANGE, *[_P] * 3)),
     "bundle_linearize": (_I, (*_RANGE, *[_P] * 6)),
-    "bundle_triangulate": (_I, (*_RANGE, *[_P] * 3, _N, _D, _D, _D)),
-    "bundle_inverse_roots": (_I, (_N, _P, _P, _D, _P, _P, _P)),
+    "bundle_refine_points": (_I, (*_RANGE, *[_P] * 5)),
+    "bundle_inverse_roots": (_I, (_N, _N, _P, _P, _N, _D, _P, _P, _P)),
     "bundle_schur": (_I, (*_RANGE, *[_P] * 7)),
     "bundle_couple": (_I, (*_RANGE, *[_P] * 7)),
-    "bundle_point_steps": (_D, (_N, *[_P] * 5)),
-    "bundle_camera_blocks": (None, (_N, *[_P] * 4)),
+    "bundle_point_steps": (_D, (_N, _N, *[_P] * 4, _N, _P)),
+    "bundle_camera_blocks": (None, (_P,) * 5),
+    "bundle_pair_blocks": (None, (_P, _N, _P, _P)),
     "bundle_whiten": (_I, (_N, _P, _P, _D, _P, _P)),
     "bundle_reduce": (None, (_P,) * 5),
     "bundle_neighbours": (None, (_P, _P)),
@@ -72,6 +114,7 @@ _TYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "bundle_step": (_I, (*[_P] * 10, _D, _P, _P)),
     "envelope_factor": (_I, (_P, _P)),
     "envelope_solve": (None, (_P, _P, _N, _P)),
+    "skyline_reduce": (None, (_P, _P, _N, _N, _P, _N, _N, _P, _P, _P)),
 }
 
 

@@ -1,0 +1,188 @@
+/* The factored route: a projective camera's Jacobian is a (x) Q^T, a (2, 3) = d q_hat / d h, so its
+   sums are a few factors times the moments Q Q^T of the points. */
+#include "bundle_moments.h"
+#include "bundle_pairs.h"
+
+static void squared(const eg_pass *p)
+{
+    eg_squared_distance(p->chunk.M, p->cameras, p->points, p->q, p->squared);
+}
+
+static void sight(const eg_pass *p, const double *points, double *own)
+{
+    const ptrdiff_t M = p->chunk.M;
+    if (p->bundle->loss != EG_LINEAR)
+        eg_squared_distance(M, p->cameras, points, p->q, p->squared);
+    eg_weigh(p);
+    eg_point_normal(M, p->cameras, points, p->q, p->w, own, own + 10 * M, own + 20 * M, p->squared);
+}
+
+/* Sums of a camera: for the six entries of w a^T a and for depth the moments Q Q^T, then e Q^T. */
+static void observe(const eg_pass *p, double *own, double *cameras)
+{
+    const ptrdiff_t M = p->chunk.M;
+    double *factors = p->work;
+    sight(p, p->points, own);
+    eg_camera_normal(M, p->cameras, p->points, p->q, p->w, factors, factors + 6 * M,
+                     factors + 7 * M);
+    for (ptrdiff_t j = 0, next; j < p->filled; j = next) {
+        next = eg_run(p->view, j, p->filled);
+        const double *moment = p->moments + 16 * j, *factor = factors + j;
+        double *sum = cameras + EG_CAMERA * p->view[j], *low = sum + 7 * 8;
+        eg_accumulate(next - j, factor, M, moment, sum, low);
+        eg_accumulate(next - j, factor + 3 * M, M, moment, sum + 3 * 8, low + 3 * 4);
+        eg_accumulate_one(next - j, factor + 6 * M, moment, sum + 6 * 8, low + 6 * 4);
+        eg_accumulate_points(next - j, factor + 7 * M, M, moment, sum + 7 * EG_MOMENTS);
+    }
+}
+
+/* F = w a^T a P T, (3, 4). */
+static void couple(const eg_pass *p, const double *roots, double *F)
+{
+    if (p->bundle->loss != EG_LINEAR)
+        squared(p);
+    eg_weigh(p);
+    eg_coupling(p->chunk.M, p->cameras, p->points, p->w, roots, F);
+}
+
+static void to_points(const eg_pass *p, const double *F, const double *x, double *v)
+{
+    const ptrdiff_t M = p->chunk.M;
+    const double *Q = p->points;
+    double *moved = p->work;
+    for (int a = 0; a < 3; ++a) {
+        EG_SIMD
+        for (ptrdiff_t j = 0; j < M; ++j)
+            moved[a * M + j] = x[(4 * a) * M + j] * Q[j] + x[(4 * a + 1) * M + j] * Q[M + j]
+                               + x[(4 * a + 2) * M + j] * Q[2 * M + j]
+                               + x[(4 * a + 3) * M + j] * Q[3 * M + j];
+    }
+    for (int k = 0; k < 4; ++k) {
+        EG_SIMD
+        for (ptrdiff_t j = 0; j < M; ++j)
+            v[k * M + j] += F[k * M + j] * moved[j] + F[(4 + k) * M + j] * moved[M + j]
+                            + F[(8 + k) * M + j] * moved[2 * M + j];
+    }
+}
+
+static void to_cameras(const eg_pass *p, const double *F, const double *v, double *cameras)
+{
+    const ptrdiff_t M = p->chunk.M;
+    double *y = p->work;
+    for (int a = 0; a < 3; ++a) {
+        EG_SIMD
+        for (ptrdiff_t j = 0; j < M; ++j)
+            y[a * M + j] = F[(4 * a) * M + j] * v[j] + F[(4 * a + 1) * M + j] * v[M + j]
+                           + F[(4 * a + 2) * M + j] * v[2 * M + j]
+                           + F[(4 * a + 3) * M + j] * v[3 * M + j];
+    }
+    for (ptrdiff_t j = 0, end; j < p->filled; j = end) {
+        end = eg_run(p->view, j, p->filled);
+        eg_accumulate_points(end - j, y + j, M, p->moments + 16 * j, cameras + 12 * p->view[j]);
+    }
+}
+
+/* Lanes that hold a point, where all of these are seen by the same views, once; else 0. */
+static ptrdiff_t alike(const eg_chunk *chunk)
+{
+    const ptrdiff_t M = chunk->M, lanes = eg_filled(chunk, 0, M);
+    if (chunk->count[lanes - 1] < chunk->count[0])
+        return 0;
+    for (ptrdiff_t s = 0; s < chunk->L; ++s)
+        if (eg_run(chunk->view + s * M, 0, lanes) < lanes || eg_repeated(chunk, s, 0))
+            return 0;
+    return lanes;
+}
+
+/* Add to the pairs of a chunk whose points are seen by the same views: pair by pair, the factors
+   F_s F_t^T of all points at once (in work), the sums in registers. */
+static void add_alike(const eg_pass *p, const eg_envelope *envelope, ptrdiff_t lanes,
+                      const double *F, double *pairs)
+{
+    const eg_chunk *chunk = &p->chunk;
+    const ptrdiff_t M = chunk->M;
+    double *X = p->work;
+    for (ptrdiff_t t = 0; t < chunk->L; ++t)
+        for (ptrdiff_t s = 0; s <= t; ++s) {
+            const double *Fs = F + 12 * s * M, *Ft = F + 12 * t * M;
+            double *sum = eg_pair_of(envelope, EG_PAIR, chunk->view[t * M], chunk->view[s * M], pairs);
+            for (int a = 0; sum && a < 3; ++a)
+                for (int b = 0; b < 3; ++b) {
+                    EG_SIMD
+                    for (ptrdiff_t j = 0; j < M; ++j)
+                        X[(3 * a + b) * M + j] =
+                            Fs[(4 * a) * M + j] * Ft[(4 * b) * M + j]
+                            + Fs[(4 * a + 1) * M + j] * Ft[(4 * b + 1) * M + j]
+                            + Fs[(4 * a + 2) * M + j] * Ft[(4 * b + 2) * M + j]
+                            + Fs[(4 * a + 3) * M + j] * Ft[(4 * b + 3) * M + j];
+                }
+            for (int e = 0; sum && e < 9; e += 3)
+                eg_accumulate(lanes, X + e * M, M, p->moments, sum + 8 * e, sum + 9 * 8 + 4 * e);
+        }
+}
+
+/* Y (3, 4) turned. */
+EG_INLINE void turn(const double *Y, double *across)
+{
+    for (int b = 0; b < 3; ++b)
+        for (int c = 0; c < 4; ++c)
+            across[4 * c + b] = Y[4 * b + c];
+}
+
+/* sum += X x moments for the nine entries of X = Ys Yt^T: Ys (3, 4), and Yt (4, 4) turned. */
+EG_INLINE void add_pair(const eg_route *route, ptrdiff_t run, ptrdiff_t stride,
+                        const double *EG_RESTRICT Ys, const double *EG_RESTRICT Yt,
+                        const double *EG_RESTRICT moments, double *EG_RESTRICT sum)
+{
+    (void)route, (void)run, (void)stride;
+    for (int a = 0; a < 3; ++a)
+        for (int b = 0; b < 3; ++b) {
+            const double x = Ys[4 * a] * Yt[b] + Ys[4 * a + 1] * Yt[4 + b]
+                             + Ys[4 * a + 2] * Yt[8 + b] + Ys[4 * a + 3] * Yt[12 + b];
+            EG_SIMD
+            for (int k = 0; k < 8; ++k)
+                sum[8 * (3 * a + b) + k] += x * moments[k];
+            EG_SIMD
+            for (int k = 0; k < 4; ++k)
+                sum[9 * 8 + 4 * (3 * a + b) + k] += x * moments[8 + k];
+        }
+}
+
+/* (F_s F_t^T) x Q Q^T: nine rows of moments a pair, row (a, b) for row a of the view with the lower
+   number. */
+static void pairs(const eg_pass *p, const eg_envelope *envelope, const double *F,
+                  double *EG_RESTRICT turned, ptrdiff_t *views, int32_t *sorted, double *sums)
+{
+    const eg_chunk *chunk = &p->chunk;
+    const ptrdiff_t M = chunk->M, L = chunk->L, lanes = alike(chunk);
+    if (lanes) {
+        add_alike(p, envelope, lanes, F, sums);
+        return;
+    }
+    for (ptrdiff_t s = 0; s < L; ++s)
+        for (ptrdiff_t j = 0; j < M && s < chunk->count[j]; ++j)
+            for (ptrdiff_t k = 0; k < 12; ++k)
+                turned[12 * (L * j + s) + k] = F[(12 * s + k) * M + j];
+    eg_add_by_view(p, envelope, 12, 1, turned, views, sorted, sums, turn, add_pair);
+}
+
+const eg_route eg_factored_route = {
+    .factored = 1,
+    .camera = 12,
+    .point = 4,
+    .tangent = 12,
+    .padded = EG_MOMENTS,
+    .camera_sums = EG_CAMERA,
+    .pair_sums = EG_PAIR,
+    .sums = 24,
+    .factors = 12,
+    .turned = 12,
+    .work = 10,
+    .squared = squared,
+    .sight = sight,
+    .observe = observe,
+    .couple = couple,
+    .to_points = to_points,
+    .to_cameras = to_cameras,
+    .pairs = pairs,
+};

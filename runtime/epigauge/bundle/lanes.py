@@ -1,0 +1,179 @@
+"""The observations in the order in which the C library passes over them."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge._library import address
+from epigauge._native import LANES, Bundle, function
+from epigauge.bundle.linearizer import LEAST_WEIGHT
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.skyline import Skyline, narrow
+from epigauge.two_view.losses import LOSSES, Loss
+
+__all__ = ["LaneLayout", "Range"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Range = tuple[int, int]
+
+#: Observations a chunk, so that it stays in the fast cache, and the most lanes.
+_ROWS, _MOST_LANES = 384, 56
+
+#: Cameras of which a full matrix is factored in no time.
+_FULL = 10
+
+#: What the passes over an observation cost, in pairs of observations, and what a point costs in a
+#: pass, in observations.
+_PASSES, _POINT = 20, 3
+
+#: Least work of a thread, in pairs of observations: with less, to hand it over costs more than it
+#: saves.
+_SHARE = 1e5
+
+
+class LaneLayout:
+    """The observations in the order of the chunks (bundle.h), and the skyline of pairs they give.
+
+    Parameters
+    ----------
+    graph : ObservationGraph
+        Which observation belongs to what.
+    q, weights : ndarray, shape (2, N), (N,)
+        Measurements and their weights.
+    model : int
+        Row of the camera model in the C library's table, or `FACTORED`.
+    columns : ndarray of int32, shape (k,)
+        Entries of a camera's tangent that are computed with.
+
+    Attributes
+    ----------
+    lanes, rows : ndarray of int
+        Where the lanes and the observations of each chunk begin.
+    order : ndarray of int, shape (n,), or None
+        Numbers of the cameras in the order of the skyline; None where it is their own.
+    """
+
+    def __init__(
+        self,
+        graph: ObservationGraph,
+        q: Array,
+        weights: Array,
+        model: int,
+        columns: NDArray[np.int32],
+    ) -> None:
+        self._graph, self._q, self._weights, self.columns = graph, q, weights, columns
+        counts = np.diff(graph.first)
+        points = _together(graph, counts)
+        self.lanes, self.rows = _chunks(counts[points])
+        filling, rows = self.lanes[-1] - len(points), self.rows[-1]
+        self._point = np.concatenate([points, np.full(filling, points[-1])]).astype(np.int32)
+        self._count = np.concatenate([counts[points], np.zeros(filling)]).astype(np.int32)
+        self._observed = np.empty(rows, np.int32), np.empty(2 * rows), np.empty(rows)
+        self.order: Indices | None = None
+        self._skyline: Skyline | None = None
+        arrays = (self.lanes, self.rows, self._point, self._count, *self._observed)
+        self._bundle = Bundle(
+            graph.n_views,
+            graph.n_points,
+            len(self.lanes) - 1,
+            *map(address, arrays),
+            least=LEAST_WEIGHT * float(weights.max()),
+            model=model,
+            width=len(columns),
+            columns=address(columns),
+        )
+        self._pack(graph.view, q, weights)
+
+    def bundle(self, loss: Loss) -> Bundle:
+        """Return the C structure."""
+        made = Bundle.from_buffer_copy(self._bundle)
+        made.scale2, made.loss = loss.scale**2, LOSSES.index(loss.name)
+        return made
+
+    def shares(self, count: int) -> tuple[list[Range], list[Range]]:
+        """Split the chunks into at most so many ranges of about equal work.
+
+        Once for passes over the observations, once for those over pairs of observations of a
+        point; little work makes fewer ranges.
+        """
+        rows, lanes = np.diff(self.rows), np.diff(self.lanes)
+        pairs = rows * (rows // lanes + _PASSES)
+        count = max(1, min(count, int(pairs.sum() / _SHARE)))
+        return _ranges(rows + _POINT * lanes, count), _ranges(pairs, count)
+
+    @property
+    def skyline(self) -> Skyline:
+        """Return the skyline of pairs; the cameras get the order that narrows it when first asked.
+
+        Until then it is not known to any array of cameras.
+        """
+        if self._skyline is None:
+            graph, n = self._graph, self._graph.n_views
+            self._skyline = Skyline.full(n)
+            if n > _FULL:
+                # The lowest view that shares a point with each.
+                lowest = np.arange(n)
+                np.minimum.at(lowest, graph.view, graph.view[graph.first[:-1]][graph.point])
+                self._skyline = Skyline.of(lowest)
+            if self._skyline.wide:
+                together = np.zeros((n, n), np.bool_)
+                function("bundle_neighbours")(ctypes.byref(self._bundle), address(together))
+                self._skyline, self.order = narrow(together)
+            if self.order is not None:
+                number = np.argsort(self.order)[graph.view]
+                rows = np.lexsort((number, graph.point))
+                self._pack(number[rows], self._q[:, rows], self._weights[rows])
+        return self._skyline
+
+    def inward(self, cameras: Any) -> Any:
+        """Return rows of cameras in the order of the skyline, contiguous; None stays None."""
+        if cameras is None:
+            return None
+        return np.ascontiguousarray(cameras if self.order is None else cameras[self.order])
+
+    def outward(self, cameras: Array) -> Array:
+        """Return rows of cameras from the order of the skyline in their own."""
+        if self.order is None:
+            return cameras
+        result = np.empty_like(cameras)
+        result[self.order] = cameras
+        return result
+
+    def _pack(self, view: Indices, q: Array, weights: Array) -> None:
+        """Copy the observations, sorted by point, then view."""
+        arrays = [np.ascontiguousarray(a) for a in (self._graph.first, view, q, weights)]
+        reference = ctypes.byref(self._bundle)
+        function("bundle_pack")(reference, *map(address, (*arrays, *self._observed)))
+
+
+def _ranges(work: Indices, count: int) -> list[Range]:
+    """Return ranges of about equal work; a chunk belongs to that which its middle falls into."""
+    middles = np.cumsum(work) - work / 2.0
+    cuts = np.searchsorted(middles, work.sum() * np.arange(1, count) / count)
+    edges = [0, *cuts.tolist(), len(work)]
+    return [(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+
+
+def _together(graph: ObservationGraph, counts: Indices) -> Indices:
+    """Return the points by falling number of observations, those of the same views together."""
+    first, last, view = graph.first[:-1], graph.first[1:] - 1, graph.view
+    return np.lexsort((view[last], view[np.minimum(first + 1, last)], view[first], -counts))
+
+
+def _chunks(counts: Indices) -> tuple[Indices, Indices]:
+    """Return where the lanes and the rows of each chunk begin, for falling counts."""
+    lanes, rows = [0], [0]
+    begin, m = 0, len(counts)
+    while begin < m:
+        slots = int(counts[begin])
+        width = min(max(_ROWS // slots // LANES * LANES, LANES), _MOST_LANES)
+        width = min(width, -(-(m - begin) // LANES) * LANES)
+        lanes.append(lanes[-1] + width)
+        rows.append(rows[-1] + width * slots)
+        begin += width
+    return np.array(lanes, np.intp), np.array(rows, np.intp)

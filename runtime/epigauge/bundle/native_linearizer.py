@@ -1,0 +1,426 @@
+"""The evaluation in C: one pass over the observations of each point, no Jacobian stored.
+
+Two routes share all loops (runtime/c/bundle*.c). Projective cameras have J_camera = a (x) Q^T, so
+that their sums are a few factors times the moments Q Q^T of the points; any other model is computed
+with by its kernels `observe`, `residual` and `sight`. Same interface as `numpy_linearizer`.
+"""
+
+from __future__ import annotations
+
+import copy
+import ctypes
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge._library import address
+from epigauge._native import (
+    BLOCK,
+    FACTORED,
+    MOST_TANGENT,
+    TRACE,
+    Refinement,
+    aligned_zeros,
+    checked,
+    function,
+)
+from epigauge.bundle.lanes import LaneLayout, Range
+from epigauge.bundle.linearizer import Normal, PointRefinement
+from epigauge.bundle.numpy_linearizer import DENSE_CAMERAS
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.skyline import Skyline, SkylineFactor
+from epigauge.cameras import CameraModel
+from epigauge.two_view.losses import Loss
+
+__all__ = ["NativeLinearizer"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: A reduced system is factored where that takes at most so many products of blocks, or so many an
+#: observation: about what a hundred conjugate gradients cost.
+_QUICK, _PATIENCE = 1e6, 20.0
+
+
+class NativeLinearizer:
+    """The evaluation by the C library.
+
+    Parameters
+    ----------
+    model : CameraModel
+        The camera.
+    graph : ObservationGraph
+        Which observation belongs to what.
+    q : ndarray, shape (2, N)
+        Measurements.
+    weights : ndarray, shape (N,)
+        Factor of each squared residual.
+    loss : Loss
+        Applied to each squared residual.
+    workers : int
+        Threads; each has a share of the points and sums of its own, added up in a fixed order.
+    columns : sequence of int, optional
+        Entries of a camera's tangent that are computed with; all others count as known: their rows
+        in the normal equations are zero. By default all.
+    factored : bool, optional
+        Whether projective cameras go by their factors; by default they do.
+    """
+
+    def __init__(
+        self,
+        model: CameraModel,
+        graph: ObservationGraph,
+        q: Array,
+        weights: Array,
+        loss: Loss,
+        workers: int = 1,
+        columns: ArrayLike | None = None,
+        factored: bool | None = None,
+    ) -> None:
+        self.model, self.graph, self.loss = model, graph, loss
+        self.q, self.weights = q, weights
+        by_factors = model.name == "projective" if factored is None else factored
+        row = FACTORED if by_factors else function("camera_model_row")(model.prefix.encode())
+        whole = np.arange(model.tangent_size)
+        used = whole if columns is None or by_factors else np.unique(np.asarray(columns, np.intp))
+        if len(used) > MOST_TANGENT:
+            raise NotImplementedError(
+                f"{model.name} has {len(used)} unknowns a camera, the C library at most "
+                f"{MOST_TANGENT}: backend='numpy' takes any"
+            )
+        #: None where all entries are computed with.
+        self._used: Indices | None = None if len(used) == len(whole) else used
+        self._layout = LaneLayout(graph, q, weights, row, used.astype(np.int32))
+        self._bundle = self._layout.bundle(loss)
+        self.reference = ctypes.byref(self._bundle)
+        widths = np.zeros(3, np.intp)
+        function("bundle_widths")(self.reference, address(widths))
+        self._camera_sums, self._pair_sums, self._row = widths.tolist()
+        self._passes, self._pairs = self._layout.shares(workers)
+        # The calling thread has the first share.
+        others = max(len(self._passes), len(self._pairs)) - 1
+        self._pool = ThreadPoolExecutor(others) if others else None
+
+    @property
+    def factored(self) -> bool:
+        """Tell whether cameras go by their factors."""
+        return bool(self._bundle.model == FACTORED)
+
+    @property
+    def skyline(self) -> Skyline:
+        """Return the skyline of the reduced system, in blocks of cameras."""
+        return self._layout.skyline
+
+    @property
+    def width(self) -> int:
+        """Return the number of entries of a tangent that are computed with."""
+        return int(self._bundle.width)
+
+    @cached_property
+    def direct(self) -> bool:
+        """Tell whether the reduced system is to be stored and factored."""
+        most = DENSE_CAMERAS * (DENSE_CAMERAS + 1) // 2
+        work, few = self.skyline.work, self.skyline.blocks <= most
+        return few and work <= max(_QUICK, _PATIENCE * len(self.graph.point))
+
+    def with_loss(self, loss: Loss) -> NativeLinearizer:
+        """Return the same observations with another loss."""
+        other = copy.copy(self)
+        other.loss, other._bundle = loss, self._layout.bundle(loss)
+        other.reference = ctypes.byref(other._bundle)
+        return other
+
+    def residuals(self, cameras: Array, points: Array) -> Array:
+        """Return r = q - q_hat, (2, N)."""
+        graph, residual = self.graph, self.model.kernel("residual", "c")
+        seen_by = np.ascontiguousarray(cameras.T[:, graph.view])
+        return np.asarray(residual(seen_by, np.ascontiguousarray(points.T[:, graph.point]), self.q))
+
+    def point_costs(self, cameras: Array, points: Array) -> Array:
+        """Return the weighted robust sum of each point, (m,); not finite in a focal plane."""
+        costs, estimate = np.empty(len(points)), self._estimate(cameras, points)
+        self._each("bundle_costs", *map(address, (*estimate, costs)))
+        return costs
+
+    def linearize(self, cameras: Array, points: Array) -> Normal:
+        """Return the normal equations."""
+        skyline = self.skyline  # the order of the cameras is settled from here on
+        n, (m, b), d = skyline.n, points.shape, self.width
+        estimate = self._estimate(cameras, points)
+        V, g = np.empty((m, b, b)), np.empty((m, b))
+        depths = np.empty((m, b, b)) if self.factored else None
+        before = tuple(map(address, (*estimate, V, depths, g)))
+        (sums,) = self._summed("bundle_linearize", before, (n, self._camera_sums))
+        U, g_cameras = np.empty((n, d, d)), np.empty((n, d))
+        of_cameras = np.empty((n, d, d)) if self.factored else None
+        arrays = map(address, (sums, U, of_cameras, g_cameras))
+        function("bundle_camera_blocks")(self.reference, *arrays)
+        blocks = None
+        if depths is not None and of_cameras is not None:
+            blocks = self._layout.outward(of_cameras), depths
+        coupling = NativeCoupling(self, *estimate)
+        return Normal(self.wide(U), V, self.wide(g_cameras), g, coupling, blocks)
+
+    def refine_points(
+        self, cameras: Array, points: Array, how: PointRefinement
+    ) -> tuple[Array, Array]:
+        """Return the points moved to where their own observations want them, and their costs."""
+        costs = np.empty(len(points))
+        inner, moved = self._layout.inward(cameras), np.array(points, order="C")
+        damping = TRACE if self.model.metric else BLOCK
+        options = Refinement(how.iterations, damping, how.lam, how.factor, how.tolerance)
+        arrays = map(address, (inner, moved, costs, None))
+        self._each("bundle_refine_points", *arrays, ctypes.addressof(options))
+        return moved, costs
+
+    def inverse_roots(self, V: Array, D: Array, lam: float, g: Array) -> tuple[Array, Array]:
+        """Return T with T T^T = (V + lam D)^-1 for blocks (m, b, b), and T^T g."""
+        m, b, _ = V.shape
+        if b not in (3, 4):
+            T = np.swapaxes(np.linalg.inv(np.linalg.cholesky(V + lam * D)), 1, 2)
+            return T, np.einsum("mij,mi->mj", T, g)
+        V, D, g = map(np.ascontiguousarray, (V, D, g))
+        T, half = np.empty((m, b, b)), np.empty((m, b))
+
+        def roots(part: slice) -> bool:
+            before, after = (V[part], D[part]), (g[part], T[part], half[part])
+            count, arrays = part.stop - part.start, map(address, after)
+            return bool(
+                function("bundle_inverse_roots")(
+                    count, b, *map(address, before), b * b, lam, *arrays
+                )
+            )
+
+        if any(self._over_points(roots)):
+            raise np.linalg.LinAlgError("the block of a point is not positive definite")
+        return T, half
+
+    # ---------------------------------------------------------------- orders and widths
+
+    def wide(self, cameras: Array) -> Array:
+        """Return vectors or blocks of the skyline's order and width in their own, zeros added."""
+        own = self._layout.outward(cameras)
+        if self._used is None:
+            return own
+        d, k = self.model.tangent_size, cameras.ndim - 1
+        result = np.zeros((len(own), *[d] * k))
+        result[np.ix_(np.arange(len(own)), *[self._used] * k)] = own
+        return result
+
+    def narrow(self, cameras: Array | None) -> Array | None:
+        """Return (n, d, ...) in the order of the skyline, without the entries that are known."""
+        if cameras is not None and self._used is not None:
+            cameras = cameras[:, self._used]
+        inner: Array | None = self._layout.inward(cameras)
+        return inner
+
+    def _estimate(self, cameras: Array, points: Array) -> tuple[Array, Array]:
+        return self._layout.inward(cameras), np.ascontiguousarray(points)
+
+    # ---------------------------------------------------------------- passes
+
+    def to_points(self, at: tuple[Array, Array], T: Array | None, x: Array) -> Array:
+        """Return T^T W^T x, (m, b)."""
+        points, inner, T = np.empty(at[1].shape), self.narrow(x), _contiguous(T)
+        self._each("bundle_couple", *map(address, (*at, T, inner, None, points, None)))
+        return points
+
+    def to_cameras(self, at: tuple[Array, Array], T: Array | None, y: Array) -> Array:
+        """Return W T y, (n, d)."""
+        T, y = _contiguous(T), np.ascontiguousarray(y)  # C has addresses only: both are kept
+        before = tuple(map(address, (*at, T, None, y, None)))
+        return self.wide(self._summed("bundle_couple", before, (len(at[0]), self.width))[0])
+
+    def schur(
+        self, at: tuple[Array, Array], T: Array, half: Array | None, skyline: Skyline
+    ) -> tuple[NativePairs, Array]:
+        """Return the pairs of W T T^T W^T within a skyline, and W T half (n, d)."""
+        T, half = np.ascontiguousarray(T), _contiguous(half)
+        before = (*map(address, (*at, T, half)), skyline.reference)
+        shapes = ((skyline.blocks, self._pair_sums), (len(at[0]), self.width))
+        pairs, cameras = self._summed("bundle_schur", before, *shapes, pairs=True)
+        return NativePairs(self, skyline, pairs), self.wide(cameras)
+
+    def _each(self, name: str, *arguments: Any) -> None:
+        """Call a C function for all chunks, which write to places of their own."""
+        call = function(name)
+        self._share(
+            self._passes, lambda _, begin, end: call(self.reference, begin, end, *arguments)
+        )
+
+    def _summed(
+        self, name: str, before: tuple[Any, ...], *shapes: tuple[int, ...], pairs: bool = False
+    ) -> list[Array]:
+        """Call a C function for all chunks, which add to its last arguments, arrays of `shapes`.
+
+        `pairs` tells that it works on pairs of observations.
+        """
+        call, ranges = function(name), self._pairs if pairs else self._passes
+        sums = [[aligned_zeros(shape) for shape in shapes] for _ in ranges]
+        self._share(
+            ranges,
+            lambda k, begin, end: call(self.reference, begin, end, *before, *map(address, sums[k])),
+        )
+        for others in sums[1:]:
+            for total, other in zip(sums[0], others, strict=True):
+                total += other
+        return sums[0]
+
+    def _over_points(self, call: Callable[[slice], Any]) -> list[Any]:
+        """Call a function with as many ranges of points as there are workers."""
+        count, m = len(self._passes), self.graph.n_points
+        edges = [m * k // count for k in range(count + 1)]
+        parts = [slice(begin, end) for begin, end in zip(edges[:-1], edges[1:], strict=True)]
+        return self._together([partial(call, part) for part in parts])
+
+    def _share(self, ranges: list[Range], call: Callable[[int, int, int], int]) -> None:
+        for status in self._together([partial(call, k, *own) for k, own in enumerate(ranges)]):
+            checked(status)
+
+    def _together(self, calls: list[Callable[[], Any]]) -> list[Any]:
+        """Make calls at the same time, the first one here."""
+        if self._pool is None:
+            return [call() for call in calls]
+        pending = [self._pool.submit(call) for call in calls[1:]]
+        try:
+            return [calls[0](), *(future.result() for future in pending)]
+        finally:  # C has addresses only: after Ctrl-C, too, the arrays stay until it is done
+            wait(pending)
+
+
+@dataclass(frozen=True)
+class NativeCoupling:
+    """The blocks W of J^T J that couple cameras and points, computed whenever they are used.
+
+    Attributes
+    ----------
+    linearizer : NativeLinearizer
+        The observations.
+    cameras, points : ndarray, shape (n, c), (m, b)
+        The estimate, cameras in the order of the skyline.
+    """
+
+    linearizer: NativeLinearizer
+    cameras: Array
+    points: Array
+
+    @property
+    def direct(self) -> bool:
+        """Tell whether the reduced system is to be stored and factored, or only iterated with."""
+        return self.linearizer.direct
+
+    def to_points(self, T: Array | None, x: Array) -> Array:
+        """Return T^T W^T x, (m, b), for x (n, d) and T (m, b, b), or one."""
+        return self.linearizer.to_points(self._at, T, x)
+
+    def to_cameras(self, T: Array | None, y: Array) -> Array:
+        """Return W T y, (n, d), for y (m, b) and T (m, b, b), or one."""
+        return self.linearizer.to_cameras(self._at, T, y)
+
+    def schur(self, T: Array, half: Array | None) -> tuple[NativePairs, Array]:
+        """Return P = W T T^T W^T, and W T half (n, d); half None is zero."""
+        return self.linearizer.schur(self._at, T, half, self.linearizer.skyline)
+
+    def diagonal(self, T: Array) -> Array:
+        """Return the diagonal blocks of P, (n, d, d)."""
+        alone = Skyline.diagonal(len(self.cameras))
+        pairs, _ = self.linearizer.schur(self._at, T, None, alone)
+        return self.linearizer.wide(pairs.blocks)
+
+    @property
+    def _at(self) -> tuple[Array, Array]:
+        return self.cameras, self.points
+
+
+@dataclass(frozen=True)
+class NativePairs:
+    """P = W T T^T W^T, what the points take off the cameras' blocks.
+
+    Attributes
+    ----------
+    linearizer : NativeLinearizer
+        The observations.
+    skyline : Skyline
+        Which blocks there are.
+    sums : ndarray, shape (l, w)
+        What the C library has added up.
+    """
+
+    linearizer: NativeLinearizer
+    skyline: Skyline
+    sums: Array
+
+    @cached_property
+    def blocks(self) -> Array:
+        """Return the blocks (l, k, k), rows for the column of the skyline's row."""
+        own, d = self.linearizer, self.linearizer.width
+        found = np.empty((len(self.sums), d, d))
+        arrays = map(address, (self.sums, found))
+        function("bundle_pair_blocks")(own.reference, len(found), *arrays)
+        return found
+
+    def factor(self, U: Array, A: Array | None) -> NativeFactor:
+        """Return a factor of U - A^T P A, blocks U (n, a, a) and A (n, d, a)."""
+        own, d = self.linearizer, self.linearizer.width
+        if A is None and d < own.model.tangent_size:
+            A = np.broadcast_to(np.eye(own.model.tangent_size), U.shape)
+        inner_U, inner_A = own._layout.inward(U), own.narrow(A)
+        if own.factored:
+            blocks, sizes = self.blocks, (d * d, d)
+        else:
+            blocks, sizes = self.sums, (own._pair_sums, own._row)
+        return NativeFactor(own, self.skyline.factor(blocks, d, sizes, inner_U, inner_A))
+
+    def times(self, x: Array) -> Array:
+        """Return P x for x (n, d, k)."""
+        own = self.linearizer
+        rows, columns = self.skyline.places
+        inner = own.narrow(x)
+        assert inner is not None
+        result = np.zeros(inner.shape)
+        across = rows != columns
+        np.add.at(result, columns, self.blocks @ inner[rows])
+        np.add.at(
+            result, rows[across], np.swapaxes(self.blocks[across], 1, 2) @ inner[columns[across]]
+        )
+        columns_of = [own.wide(np.ascontiguousarray(result[..., k])) for k in range(x.shape[2])]
+        return np.stack(columns_of, axis=2) if columns_of else np.zeros(x.shape)
+
+    def dense(self) -> Array:
+        """Return P, (n, d, n, d)."""
+        own, n = self.linearizer, self.skyline.n
+        d, order = own.model.tangent_size, own._layout.order
+        rows, columns = self.skyline.places
+        if order is not None:
+            rows, columns = order[rows], order[columns]
+        blocks = self.blocks
+        if own._used is not None:
+            blocks = np.zeros((len(blocks), d, d))
+            blocks[:, own._used[:, None], own._used] = self.blocks
+        P = np.zeros((n, n, d, d))
+        P[rows, columns] = np.swapaxes(blocks, 1, 2)
+        P[columns, rows] = blocks
+        return P.transpose(0, 2, 1, 3)
+
+
+@dataclass(frozen=True)
+class NativeFactor:
+    """A factor of the reduced system of the cameras, in the order of the skyline."""
+
+    linearizer: NativeLinearizer
+    inner: SkylineFactor
+
+    def solve(self, right: Array) -> Array:
+        """Return the solution for right-hand sides (n, a, k)."""
+        layout, (n, a, k) = self.linearizer._layout, right.shape
+        rows = layout.inward(right).reshape(n * a, k).T
+        return layout.outward(self.inner.solve(rows).T.reshape(n, a, k))
+
+
+def _contiguous(array: Array | None) -> Array | None:
+    return None if array is None else np.ascontiguousarray(array)
