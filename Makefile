@@ -18,7 +18,7 @@ SOURCES := pyproject.toml CMakeLists.txt \
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test derive derive-check lint types sanitize bench docs dist clean
+.PHONY: help demo test derive derive-check lint types sanitize mutants bench docs dist clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -44,6 +44,10 @@ types: $(STAMPS)/tox ## mypy --strict
 
 sanitize: $(STAMPS)/tox ## the C library under AddressSanitizer and UBSan (takes minutes)
 	$(TOX) -e sanitize
+
+mutants: $(STAMPS)/dev ## plant faults one at a time, report those that no test notices (takes hours)
+	$(BIN)/python tests/mutants planted
+	$(BIN)/python tests/mutants random
 
 bench: $(STAMPS)/package ## time the solvers (not part of the tests)
 	$(BIN)/python benchmarks/run.py
@@ -82,6 +86,10 @@ $(STAMPS)/tox: $(STAMPS)/venv
 # Only the tools, not the package: the derivation runs from the source tree.
 $(STAMPS)/derive: $(STAMPS)/venv pyproject.toml
 	$(PIP) install $$($(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["derive"])')
+	@touch $@
+
+$(STAMPS)/dev: $(STAMPS)/venv $(SOURCES)
+	$(PIP) install '.[dev]'
 	@touch $@
 
 $(STAMPS)/docs: $(STAMPS)/venv $(SOURCES)

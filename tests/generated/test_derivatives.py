@@ -509,6 +509,17 @@ def test_blocks_of_a_gauge_transformation():
         assert distance(block.T @ W @ block, np.eye(len(block))) <= 1e-12
 
 
+def test_the_first_epipolar_distance_is_that_in_the_first_image():
+    rng = np.random.default_rng(15)
+    F, q1, q2 = rng.standard_normal((3, 3)), rng.standard_normal(2), rng.standard_normal(2)
+    r, _ = K.epipolar(F, q1, q2)
+    for distance_px, line, q in zip(
+        r, (F.T @ [*q2, 1.0], F @ [*q1, 1.0]), (q1, q2), strict=True
+    ):
+        expected = (line[:2] @ q + line[2]) / np.hypot(*line[:2])
+        assert distance_px == pytest.approx(expected, rel=1e-12)
+
+
 @pytest.mark.parametrize("count", [1, 9, 700])
 def test_equations_of_the_8_point_algorithm(count):
     # Weights of zero and one tell which matches count; others weigh the equations.

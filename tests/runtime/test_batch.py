@@ -98,3 +98,39 @@ def test_bad_arguments_are_named_once_for_all_pairs(ragged, change, name):
     arguments = {"offsets": offsets} | change
     with pytest.raises(eg.ArgumentError, match=name):
         eg.refine_fundamental_batch(x1, x2, **arguments)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_pairs_beyond_the_first_chunk_have_starts_weights_and_results_of_their_own(workers):
+    # The compiled loop takes 64 pairs at a time: three chunks, the last of a few; pairs of several
+    # sizes, and pairs that are refused on both sides of every boundary.
+    rng = np.random.default_rng(2)
+    sizes = rng.integers(9, 20, 131)
+    sizes[[1, 62, 65, 127]] = 5
+    scenes = [eg.two_view_scene(seed=k, n_points=int(size)) for k, size in enumerate(sizes)]
+    x1, x2 = (np.concatenate([getattr(s, name) for s in scenes]) for name in ("x1", "x2"))
+    offsets = np.concatenate([[0], np.cumsum(sizes)])
+    weights = rng.uniform(0.3, 3.0, len(x1))
+    starts = np.stack(
+        [eg.fundamental_8point(s.x1[:8], s.x2[:8]) if len(s.x1) >= 8 else np.eye(3) for s in scenes]
+    )
+    batch = eg.refine_fundamental_batch(
+        x1, x2, offsets, starts, weights=weights, workers=workers, max_iter=3
+    )
+    assert sorted(batch.reasons) == [1, 62, 65, 127]
+    for k in (0, 2, 61, 63, 64, 66, 126, 128, 129, 130, *rng.integers(0, 131, 12)):
+        if k in batch.reasons:
+            continue
+        rows = slice(offsets[k], offsets[k + 1])
+        single = eg.refine_fundamental(
+            x1[rows], x2[rows], starts[k], weights=weights[rows], max_iter=3
+        )
+        np.testing.assert_array_equal(batch.F[k], single.F)
+        np.testing.assert_array_equal(batch.distances[rows], single.fun)
+        np.testing.assert_array_equal(batch.covariance[k], single.covariance)
+        assert batch.rms_px[k] == single.rms_px
+        assert batch.noise_px[k] == single.noise_px
+        assert (batch.cost[k], batch.nfev[k]) == (single.cost, single.nfev)
+        assert (batch.status[k], batch.success[k]) == (single.status, single.success)
+        assert batch.success[k] == (batch.status[k] > 0)
+    assert not batch.success.all()

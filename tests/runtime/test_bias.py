@@ -44,3 +44,18 @@ def test_weights_are_inverse_variances(scene):
 def test_restricted_matrices_are_refused(scene):
     with pytest.raises(eg.ArgumentError, match="bias_correction"):
         eg.refine_fundamental(scene.x1, scene.x2, fix="epipole1", bias_correction=True)
+
+
+def test_correction_lowers_the_bias_where_noise_is_strong():
+    # The mean of many estimates of one scene, against the truth: sideways motion, few points.
+    bias = {False: [], True: []}
+    truth = eg.two_view_scene(6.0, n_points=20, noise_px=0.0, seed=4)
+    rng = np.random.default_rng(0)
+    for _ in range(120):
+        x1, x2 = (x + 2.0 * rng.standard_normal(x.shape) for x in (truth.x1_true, truth.x2_true))
+        for corrected in bias:
+            F = eg.refine_fundamental(x1, x2, noise_px=2.0, bias_correction=corrected).F
+            d, *_ = eg.reprojection_distances(F, truth.x1_true, truth.x2_true)
+            bias[corrected].append(d * np.sign(np.sum(F * truth.F_true)))
+    plain, moved = (float(np.sum(np.mean(bias[k], axis=0) ** 2)) for k in (False, True))
+    assert moved < plain

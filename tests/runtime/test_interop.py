@@ -190,6 +190,22 @@ def test_poselib_roundtrip_and_motion(poselib) -> None:
     np.testing.assert_allclose(pair.pose.R @ [1.0, 2.0, 3.0], result.R @ [1.0, 2.0, 3.0])
 
 
+def test_poselibs_calibrations_stay_with_their_images(poselib) -> None:
+    K1, K2 = np.diag([900.0, 950.0, 1.0]), np.diag([1300.0, 1250.0, 1.0])
+    K1[:2, 2], K2[:2, 2] = (500.0, 420.0), (650.0, 480.0)
+    result = eg.refine_fundamental(X1, X2, essential=True, K1=K, K2=K)
+    pair = interop.to_poselib(result.R, result.t, K1, K2, ((1000, 840), (1300, 960)))
+    G, one, two = interop.from_poselib(pair)
+    np.testing.assert_array_equal(one, K1)
+    np.testing.assert_array_equal(two, K2)
+    # Of points seen by these cameras, and not by the exchanged ones.
+    rng = np.random.default_rng(1)
+    X = rng.uniform((-1.0, -1.0, 5.0), (1.0, 1.0, 7.0), (30, 3))
+    q1, q2 = X @ K1.T, (X @ result.R.T + result.t) @ K2.T
+    d, *_ = eg.reprojection_distances(G, q1[:, :2] / q1[:, 2:], q2[:, :2] / q2[:, 2:])
+    assert np.abs(d).max() < 1e-9
+
+
 def test_poselibs_estimate_is_a_start(poselib) -> None:
     camera = poselib.Camera("SIMPLE_PINHOLE", [1000.0, 600.0, 500.0], 1200, 1000)
     pose, _ = poselib.estimate_relative_pose(X1, X2, camera, camera, {"max_epipolar_error": 1.0})

@@ -365,3 +365,18 @@ def test_ply_is_what_its_header_says(tmp_path) -> None:
     table = np.frombuffer(body, dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
     np.testing.assert_array_equal(table["xyz"], xyz.astype(np.float32))
     np.testing.assert_array_equal(table["rgb"], rgb)
+
+
+def test_weights_stay_with_their_observations_where_some_are_dropped(tmp_path) -> None:
+    # Observations in random order, of which the kept ones are not the first.
+    rng = np.random.default_rng(4)
+    view, point = map(np.ravel, np.meshgrid(np.arange(4), np.arange(9), indexing="ij"))
+    xy, weights = rng.uniform(0.0, 100.0, (36, 2)), rng.uniform(0.5, 2.0, 36)
+    order = rng.permutation(36)
+    path = tmp_path / "tracks.npz"
+    np.savez(path, view=view[order], point=point[order], xy=xy[order], weights=weights[order])
+    found = eg.load_tracks(path, views=[1, 2, 3])
+    by_place = {tuple(place): weight for place, weight in zip(xy, weights, strict=True)}
+    assert len(found) == 27
+    for place, weight in zip(found.xy, found.weights, strict=True):
+        assert weight == by_place[tuple(place)]

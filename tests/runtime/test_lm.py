@@ -405,3 +405,49 @@ def test_max_iter_out_of_range_is_refused_by_name(value) -> None:
 
 def test_limits_of_the_tolerances_are_accepted() -> None:
     Stopping(ftol=0.0, xtol=0, gtol=np.float64(0.5), max_iter=np.int64(1))
+
+
+@dataclass
+class Recorder(Classic):
+    """A schedule that remembers the gain ratios it is told."""
+
+    ratios: list[float] = field(default_factory=list)
+
+    def accepted(self, lam: float, ratio: float) -> float:
+        self.ratios.append(ratio)
+        return super().accepted(lam, ratio)
+
+
+class TestGainRatio:
+    def test_is_the_actual_over_the_predicted_decrease(self) -> None:
+        promised: list[float] = []
+
+        class Noted(Dense):
+            def predicted(self, step: np.ndarray) -> float:
+                promised.append(super().predicted(step))
+                return promised[-1]
+
+        schedule = Recorder()
+        problem = rosenbrock(3, system=Noted)
+        found = minimize(problem, np.array([-1.2, 1.0, 0.3]), Levenberg(), schedule, Stopping())
+        costs = [row.cost for row in found.history if row.accepted]
+        assert len(schedule.ratios) == len(promised) == len(costs) - 1 > 5
+        expected = -np.diff(costs) / promised
+        np.testing.assert_allclose(schedule.ratios, expected, rtol=1e-12)
+        assert np.abs(np.log(expected)).max() > 0.1  # upside down it would be another number
+
+    def test_is_one_where_the_model_is_exact(self) -> None:
+        schedule = Recorder()
+        minimize(linear(), np.array([5.0, -3.0]), Levenberg(), schedule, Stopping(max_iter=2))
+        np.testing.assert_allclose(schedule.ratios, 1.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize("change", [1e-3, 1e-6, 1e-9, 1e-13])
+def test_a_rejected_step_however_small_its_harm_is_no_convergence(change: float) -> None:
+    # The first trial is made out to be a little worse than the start; the minimum is elsewhere.
+    start = 0.5 * float(np.sum(rosenbrock().residual(ROSENBROCK_START) ** 2))
+    problem = rosenbrock(cost=lambda k, cost: start * (1.0 + change) if k == 1 else cost)
+    found = minimize(problem, ROSENBROCK_START, Levenberg(), Classic(), Stopping())
+    assert not found.history[1].accepted
+    assert found.nit > 2
+    np.testing.assert_allclose(found.state.x, 1.0, atol=1e-6)

@@ -177,6 +177,19 @@ def test_robust_scale_of_normal_distances_is_their_standard_deviation():
     assert robust_scale(d) < 6.0
 
 
+@pytest.mark.parametrize("count", [16, 24])
+def test_robust_scale_of_what_seven_parameters_leave_is_that_of_the_noise(count):
+    # Least squares of seven parameters: the residuals are smaller than the noise.
+    rng = np.random.default_rng(3)
+    found = []
+    for _ in range(2000):
+        A, noise = rng.standard_normal((count, 7)), rng.standard_normal(count)
+        found.append(robust_scale(noise - A @ np.linalg.lstsq(A, noise, rcond=None)[0]))
+    # The factor 1 + 5 / (m - 7) is Rousseeuw's and approximate.
+    assert np.mean(found) == pytest.approx(1.0, abs=0.25)
+    assert robust_scale(np.ones(count)) == pytest.approx(1.4826 * (1.0 + 5.0 / (count - 7)))
+
+
 @pytest.mark.parametrize("loss", ["huber", "soft_l1", "cauchy", "truncated"])
 def test_gross_error_changes_a_robust_estimate_little(loss):
     scene = eg.two_view_scene(n_points=60, distance=4.0, noise_px=0.5, seed=4)

@@ -111,6 +111,50 @@ class TestMinima:
                 assert result.cost == result.minima[0].cost
                 assert "not oriented" in result.flags
 
+    @pytest.mark.parametrize(
+        ("points", "distance", "seed"),
+        [(12, 20.0, 21), (12, 30.0, 21), (12, 40.0, 20), (12, 40.0, 6), (12, 20.0, 0)],
+    )
+    def test_a_lower_minimum_that_no_cameras_explain_is_no_rival(
+        self, points: int, distance: float, seed: int
+    ) -> None:
+        # Scenes of few points whose lowest minimum is not oriented.
+        view = eg.two_view_scene(distance, n_points=points, seed=seed)
+        result = eg.refine_fundamental(view.x1, view.x2, starts=6)
+        possible = [minimum for minimum in result.minima if minimum.oriented]
+        assert not result.minima[0].oriented
+        assert result.cost == possible[0].cost > result.minima[0].cost
+        bound = result.cost + 0.5 * 9.0 * 2.0 * result.cost / (points - 7)
+        assert result.ambiguous == (sum(m.cost <= bound for m in possible) > 1)
+
+    @pytest.mark.parametrize(
+        ("points", "distance", "seed"),
+        [(12, 12.0, 10), (12, 16.0, 7), (12, 30.0, 0), (50, 12.0, 5), (50, 12.0, 20)],
+    )
+    def test_a_minimum_more_than_three_deviations_above_is_no_rival(
+        self, points: int, distance: float, seed: int
+    ) -> None:
+        view = eg.two_view_scene(distance, n_points=points, seed=seed)
+        result = eg.refine_fundamental(view.x1, view.x2, starts=6)
+        noise2 = 2.0 * result.cost / (points - 7)
+        above = [2.0 * (m.cost - result.cost) / noise2 for m in result.minima if m.oriented]
+        assert 9.0 < sorted(above)[1] < 18.0
+        assert not result.ambiguous
+
+    def test_starts_that_have_not_converged_are_no_minima(self) -> None:
+        counted = tried = 0
+        for seed in range(12):
+            view = eg.two_view_scene(16.0, seed=seed)
+            if not eg.refine_fundamental(view.x1, view.x2, max_iter=14).success:
+                continue  # the first start is listed in any case
+            result = eg.refine_fundamental(view.x1, view.x2, starts=6, max_iter=14)
+            tried += 6
+            counted += sum(minimum.count for minimum in result.minima)
+            for minimum in result.minima:
+                again = eg.refine_fundamental(view.x1, view.x2, minimum.F)
+                assert again.cost == pytest.approx(minimum.cost, rel=1e-6)
+        assert 0 < tried // 6 < counted < tried  # some converge, some do not
+
     def test_result_states_ambiguity_by_its_inequality(self) -> None:
         outcomes = set()
         # At 10 m the rival is 20 noise^2 above, at 12 m 4

@@ -65,6 +65,18 @@ def test_consensus_finds_the_right_matches_from_a_poor_start(share):
     assert np.mean(inlier[~right]) < 0.2 if share else True
 
 
+@pytest.mark.parametrize("m", [14, 24])
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_of_an_agreement_allows_for_the_seven_parameters_of_f(m, seed):
+    # All matches right, F their own minimum: what is left are m - 7 squares of the noise.
+    scene = eg.two_view_scene(6.0, n_points=m, seed=seed)
+    frame, consensus = consensus_of(scene.x1, scene.x2)
+    result = eg.refine_fundamental(scene.x1, scene.x2)
+    found = consensus.judge(frame.from_pixels(result.F), 1.0 / frame.scale, 0.95)
+    variance = (found.sigma * frame.scale) ** 2
+    assert variance == pytest.approx(2.0 * result.cost / (m - 7), rel=0.02)
+
+
 def test_score_of_an_agreement_does_not_depend_on_the_start_of_its_scale():
     scene, x1, x2, _ = spoilt(60)
     frame, consensus = consensus_of(x1, x2)
