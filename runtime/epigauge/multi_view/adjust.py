@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from epigauge.multi_view import dampings, far
 from epigauge.multi_view.gauge import GAUGES, Gauge, five_points, identity, normalized
 from epigauge.multi_view.initialize import Frame, initialize
 from epigauge.multi_view.problem import BundleProblem
+from epigauge.multi_view.rejection import without_gross_errors
 from epigauge.multi_view.strategies import (
     STRATEGIES,
     ExplicitProblem,
@@ -55,7 +57,8 @@ class BundleResult:
     reconstruction : Reconstruction or MetricReconstruction
         Cameras and points, of the kind of the start; with method "covariant" in its basis.
     rms_px : float
-        sqrt(sum of squared residual coordinates / (2 N)).
+        sqrt(sum of squared residual coordinates / (2 N)), of the N observations whose weight is not
+        zero and that were not set aside.
     cost : float
         0.5 * (weighted, robust) sum of squared residuals, in px^2.
     fun : ndarray, shape (N, 2)
@@ -112,6 +115,7 @@ def bundle_adjust(
     damping: str | None = None,
     embedded: bool = True,
     schedule: str = "classic",
+    robust: bool = False,
     loss: str = "linear",
     loss_scale_px: float | str = "auto",
     ftol: float = 1e-8,
@@ -159,8 +163,15 @@ def bundle_adjust(
         With "covariant", re-triangulate all points after each step.
     schedule : {"classic", "nielsen"}
         Rule for lambda.
+    robust : bool
+        For measured tracks with gross errors: begin from what most observations agree on
+        (``initialize(tracks, robust=True)``), adjust with a Cauchy loss, set aside what is beyond
+        six standard deviations of the noise, and adjust the rest with the `loss` asked for, until
+        the same is set aside again. What was is told in `rejected`; it has no part in cost, RMS,
+        flags and rank. Counts and history are those of the last adjustment.
     loss : {"linear", "huber", "soft_l1", "cauchy", "truncated"}
-        Robust loss of each squared residual.
+        Loss of each squared residual. A robust one weighs gross errors down from a start that is
+        not bent by them; see `robust` for one that finds it.
     loss_scale_px : float or "auto"
         Scale of the loss in pixels; by default from the residuals of the start, which had better
         not be far then.
@@ -206,6 +217,30 @@ def bundle_adjust(
     >>> tracks, scene = eg.load_scene("sparse/0")  # doctest: +SKIP
     >>> eg.bundle_adjust(tracks, scene, refine=("f", "k"), fixed_views=[0])  # doctest: +SKIP
     """
+    if robust:
+        options: dict[str, Any] = {
+            "refine": refine,
+            "fixed_views": tuple(fixed_views),
+            "fixed_points": tuple(fixed_points),
+            "priors": None if priors is None else tuple(priors),
+            "method": method,
+            "gauge": gauge,
+            "gauge_mode": gauge_mode,
+            "damping": damping,
+            "embedded": embedded,
+            "schedule": schedule,
+            "ftol": ftol,
+            "xtol": xtol,
+            "gtol": gtol,
+            "max_iter": max_iter,
+            "workers": workers,
+            "backend": backend,
+            "callback": callback,
+        }
+        table = kernels.table(backend)
+        start = initialize(tracks, robust=True, backend=backend) if start is None else start
+        last = as_choice("loss", loss, LOSSES), loss_scale_px
+        return without_gross_errors(partial(bundle_adjust, **options), tracks, start, table, last)
     strategy = STRATEGIES[as_choice("method", method, STRATEGIES)]
     as_choice("gauge_mode", gauge_mode, ("explicit", "implicit"))
     as_choice("schedule", schedule, _SCHEDULES)
@@ -327,7 +362,7 @@ def _result(
     residuals = tracks.xy - reconstruction.project(tracks)
     return BundleResult(
         reconstruction=reconstruction,
-        rms_px=float(np.sqrt(np.mean(residuals**2))),
+        rms_px=float(np.sqrt(np.mean(residuals[tracks.weights > 0.0] ** 2))),
         cost=outcome.state.cost * unit,
         fun=residuals,
         method=method,

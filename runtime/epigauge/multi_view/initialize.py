@@ -11,8 +11,10 @@ from epigauge import lm
 from epigauge._arguments import as_choice, as_count
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table, table
+from epigauge.multi_view.agreement import agreed_camera, agreed_fundamental, agreed_points
 from epigauge.multi_view.dampings import Covariant
 from epigauge.multi_view.factorization import factorized
+from epigauge.multi_view.parallax import fit_homographies
 from epigauge.multi_view.problem import BundleProblem
 from epigauge.multi_view.resection import resect
 from epigauge.multi_view.system import Layout
@@ -34,6 +36,12 @@ _PAIRS, _MATCHES = 40, 8
 #: A registration has failed whose median residual is beyond this share of the RMS of the image
 #: coordinates.
 _FAILED = 0.05
+
+#: Robust registration adjusts what it has when the number of cameras has grown by this factor.
+_GROWTH = 1.25
+
+#: Points of a pair that its parallax is measured by, where that is robust.
+_FEW = 300
 
 #: Points whose views are counted at a time.
 _CHUNK = 4096
@@ -143,7 +151,7 @@ def initialize(
     kernels, frame = table(backend), Frame.of(tracks)
     if method == "factorization":
         return _factored(tracks, frame, kernels, robust, seed)
-    found = _registered(tracks, frame, kernels, incremental)
+    found = _registered(tracks, frame, kernels, incremental, robust)
     residual = _median_residual(tracks, found)
     if method == "registration" or residual <= _FAILED * frame.scale:
         return found
@@ -165,14 +173,20 @@ def _counted(tracks: Tracks) -> Tracks:
         return tracks
 
 
-def _registered(tracks: Tracks, frame: Frame, kernels: Table, incremental: bool) -> Reconstruction:
+def _registered(
+    tracks: Tracks, frame: Frame, kernels: Table, incremental: bool, robust: bool
+) -> Reconstruction:
     tracks = _counted(tracks)
-    builder = _Builder(tracks, frame.conditioned(tracks), kernels)
-    builder.begin(*_best_pair(tracks, frame))
+    builder = _Builder(tracks, frame.conditioned(tracks), kernels, robust)
+    builder.begin(*_best_pair(tracks, frame, robust))
+    adjusted = 2
     while not builder.registered.all():
         builder.register(builder.next_view())
-        if incremental:
+        known = int(np.count_nonzero(builder.registered))
+        # Gross errors bend what hangs on a few cameras: these are adjusted as their number grows.
+        if incremental or (robust and (known >= _GROWTH * adjusted or known == tracks.n_views)):
             builder.adjust()
+            adjusted = known
     return Reconstruction(frame.cameras_out(builder.P), builder.Q)
 
 
@@ -191,7 +205,7 @@ def _median_residual(tracks: Tracks, found: Reconstruction) -> float:
     return median(np.nan_to_num(distances[tracks.weights > 0.0], nan=np.inf))
 
 
-def _best_pair(tracks: Tracks, frame: Frame) -> tuple[int, int]:
+def _best_pair(tracks: Tracks, frame: Frame, robust: bool) -> tuple[int, int]:
     """Choose the pair with the most points that no homography explains."""
     common = _common_points(tracks)
     pairs = np.argsort(-common, axis=None, kind="stable")[:_PAIRS]
@@ -202,12 +216,19 @@ def _best_pair(tracks: Tracks, frame: Frame) -> tuple[int, int]:
     chosen = np.stack(np.unravel_index(pairs, common.shape), axis=1)
     rows = {view: _rows(tracks, view) for view in np.unique(chosen)}
     both = [np.flatnonzero((rows[i] >= 0) & (rows[k] >= 0)) for i, k in chosen]
+    sizes = np.array([len(points) for points in both])
+    if robust:
+        both = [points[:: -(-len(points) // _FEW)] for points in both]
     first = np.concatenate([[0], np.cumsum([len(points) for points in both])])
     q = frame.conditioned(tracks).T
     sides = (zip(side, both, strict=True) for side in chosen.T)
     x1, x2 = (np.concatenate([q[rows[view][points]] for view, points in side]) for side in sides)
-    parallax = _homography_residuals(x1, x2, first)
-    i, k = chosen[np.argmax(np.diff(first) * parallax)]
+    if robust:
+        errors = fit_homographies(x1, x2, first).distances
+        parallax = np.array([median(part) for part in np.split(errors, first[1:-1])])
+    else:
+        parallax = _homography_residuals(x1, x2, first)
+    i, k = chosen[np.argmax(sizes * parallax)]
     return int(i), int(k)
 
 
@@ -263,8 +284,8 @@ def _homography_residuals(x1: Array, x2: Array, first: Indices) -> Array:
 class _Builder:
     """Cameras and points known so far."""
 
-    def __init__(self, tracks: Tracks, q: Array, kernels: Table) -> None:
-        self.tracks, self.q, self.kernels = tracks, q, kernels
+    def __init__(self, tracks: Tracks, q: Array, kernels: Table, robust: bool) -> None:
+        self.tracks, self.q, self.kernels, self.robust = tracks, q, kernels, robust
         self.P = np.zeros((tracks.n_views, 3, 4))
         self.Q = np.zeros((tracks.n_points, 4))
         self.registered = np.zeros(tracks.n_views, dtype=np.bool_)
@@ -277,7 +298,13 @@ class _Builder:
         x1, x2 = (self.q[:, own[points]].T for own in rows)
         backend = self.kernels.name
         try:
-            result = refine_fundamental(x1, x2, loss="cauchy", max_iter=200, backend=backend)
+            F, agrees = None, np.ones(len(points), dtype=np.bool_)
+            if self.robust:
+                F, agrees = agreed_fundamental(self.kernels, x1, x2)
+                points = points[agrees]
+            result = refine_fundamental(
+                x1[agrees], x2[agrees], F, loss="cauchy", max_iter=200, backend=backend
+            )
         except ArgumentError as error:
             raise ArgumentError(
                 "tracks",
@@ -309,7 +336,9 @@ class _Builder:
     def register(self, view: int) -> None:
         """Find the camera of a view from known points, then the points it completes."""
         rows = np.flatnonzero((self.tracks.view == view) & self.known[self.tracks.point])
-        self.P[view] = resect(self.kernels, self.q[:, rows], self.Q[self.tracks.point[rows]].T)
+        q, Q = self.q[:, rows], self.Q[self.tracks.point[rows]].T
+        start = agreed_camera(q, Q) if self.robust else None
+        self.P[view] = resect(self.kernels, q, Q, start)
         self.registered[view] = True
         # Points that it does not see are left as they are, but for a last round with all views.
         self._triangulate(None if self.registered.all() else view)
@@ -346,6 +375,8 @@ class _Builder:
         q = np.ascontiguousarray(self.q[:, rows])
         problem = BundleProblem(self.kernels, layout, q, np.ones(len(rows)), Loss())
         self.Q[points] = _triangulated(self.P, self.Q[points], self.known[points], problem)
+        if self.robust:
+            self.Q[points] = agreed_points(problem, self.P, self.Q[points], problem.loss.scale)
         self.known[points] = True
 
     def _spread(self) -> None:

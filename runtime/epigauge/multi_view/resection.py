@@ -25,7 +25,7 @@ _ROUNDS, _STEADY = 5, 1e-8
 _STOPPING = lm.Stopping(ftol=1e-6)
 
 
-def resect(kernels: Table, q: Array, Q: Array) -> Array:
+def resect(kernels: Table, q: Array, Q: Array, start: Array | None = None) -> Array:
     """Return the camera that projects points to measurements: linear, then robustly refined.
 
     Parameters
@@ -34,6 +34,8 @@ def resect(kernels: Table, q: Array, Q: Array) -> Array:
         Backend.
     q, Q : ndarray, shape (2, c), (4, c)
         At least six measurements and points.
+    start : ndarray, shape (3, 4), optional
+        What to refine; by default the camera of least algebraic error.
 
     Returns
     -------
@@ -42,7 +44,7 @@ def resect(kernels: Table, q: Array, Q: Array) -> Array:
     """
     minimized = _minimized_in_c if kernels.name == "c" else _minimized
     q, Q = np.ascontiguousarray(q), np.ascontiguousarray(Q)
-    P = _linear_camera(q, Q)
+    P = _linear_camera(q, Q) if start is None else start
     for _ in range(_ROUNDS):
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             h = P @ Q

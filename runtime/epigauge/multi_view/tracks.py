@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -163,6 +164,24 @@ class Tracks:
         tracks = cls(new_views, new_points, pixels[keep], weights=w[keep])
         return tracks, all_views[old_views], all_points[old_points]
 
+    def weighted(self, weights: ArrayLike) -> Tracks:
+        """Return the same observations with other weights.
+
+        Parameters
+        ----------
+        weights : array_like, shape (N,)
+            Factor of each squared residual, in the order of the tracks (not of their input).
+
+        Returns
+        -------
+        Tracks
+            All else is shared.
+        """
+        other = copy.copy(self)
+        other.weights = as_weights(weights, len(self)).copy()
+        other.weights.setflags(write=False)
+        return other
+
     def __len__(self) -> int:
         """Return the number of observations."""
         return len(self.view)
@@ -304,10 +323,12 @@ class Reconstruction:
         Returns
         -------
         float
-            sqrt(sum of squared residual coordinates / (2 N)), in pixels.
+            sqrt(sum of squared residual coordinates / (2 N)), in pixels, of the N observations
+            whose weight is not zero.
         """
+        counts = tracks.weights > 0.0
         with np.errstate(over="ignore"):
-            return float(np.sqrt(np.mean((tracks.xy - self.project(tracks)) ** 2)))
+            return float(np.sqrt(np.mean((tracks.xy - self.project(tracks))[counts] ** 2)))
 
 
 def _homogeneous(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:

@@ -49,6 +49,9 @@ _FEW, _COLUMNS, _ITERATIONS = 12, 4, 3
 #: Shift with which a singular matrix is factored; larger where conjugate gradients solve.
 _SHIFT, _SHIFT_ITERATIVE = 1e-12, 1e-5
 
+#: Share of single points that may be open without the rest being called undetermined.
+_OPEN = 0.05
+
 #: Share of the observations that may lie behind a camera before it is told: chance, and far points.
 BEHIND = 0.01
 
@@ -104,8 +107,8 @@ def judged(
     n_behind = behind(seen, h[:, 2])
     if not np.isfinite(distances).all():  # a point in a focal plane: there is nothing to measure
         return Verdict(("undetermined",), 0, n_behind)
-    open_directions, weakest = _open_directions(seen, Frame.of(tracks), kernels, workers)
-    missing = max(missing_by_count(seen), open_directions) + _CAMERA * lost
+    of_cameras, of_points, weakest = _open_directions(seen, Frame.of(tracks), kernels, workers)
+    of_cameras = max(missing_by_count(seen), of_cameras) + _CAMERA * lost
     N = len(distances)
     redundancy = max(2 * N - full, 1) / (2 * N)
     # Of two normal coordinates, the median distance is 1.1774 standard deviations.
@@ -113,13 +116,13 @@ def judged(
     information = max(weakest, 1e-300) * N / seen.n
     deviation = noise_px / Frame.of(tracks).scale / float(np.sqrt(information))
     raised = set(parallax_flags(seen, noise_px))
-    if missing:
+    if of_cameras or of_points > _OPEN * seen.m:
         raised.add("undetermined")
-    elif deviation > _WEAK:
+    elif of_points or deviation > _WEAK:
         raised.add("weak geometry")
     if n_behind > BEHIND * N:
         raised.add("behind the cameras")
-    return Verdict(ordered(raised), full - missing, n_behind)
+    return Verdict(ordered(raised), full - of_cameras - of_points, n_behind)
 
 
 def missing_by_count(seen: Seen) -> int:
@@ -129,26 +132,33 @@ def missing_by_count(seen: Seen) -> int:
     views, as many as F has parameters. All cameras need 11 n - 15, and each one 11, of which points
     that two other views see give two apiece.
     """
+    # A point twice in a view gives that view no more than once does.
+    once = (np.diff(seen.point, prepend=-1) != 0) | (np.diff(seen.view, prepend=-1) != 0)
+    view, point = seen.view[once], seen.point[once]
     # Points are told apart by the views that see them: sums of one random number a view.
     marks = np.random.default_rng(0).integers(0, 2**62, seen.n, dtype=np.uint64)
-    first = np.flatnonzero(np.diff(seen.point, prepend=-1))
-    lengths = np.diff(np.append(first, len(seen.point)))
-    sums = np.add.reduceat(marks[seen.view], first)
+    first = np.flatnonzero(np.diff(point, prepend=-1))
+    lengths = np.diff(np.append(first, len(point)))
+    sums = np.add.reduceat(marks[view], first)
     _, shown, sizes = np.unique(sums, return_index=True, return_counts=True)
     s = lengths[shown]
-    given = np.minimum(sizes * (2 * s - _POINT), _CAMERA * s - _GAUGE)
+    given = np.minimum(sizes * (2 * s - _POINT), np.maximum(_CAMERA * s - _GAUGE, 0))
     total = _CAMERA * seen.n - _GAUGE - int(np.sum(given))
 
     to_camera = np.where(s == 2, np.minimum(sizes, _PAIR), np.minimum(2 * sizes, _CAMERA))
     # One point of each kind stands for all.
     of_kind = np.zeros(len(first))
     of_kind[shown] = to_camera
-    own = np.bincount(seen.view, weights=np.repeat(of_kind, lengths))
+    own = np.bincount(view, weights=np.repeat(of_kind, lengths))
     return max(total, int(_CAMERA - own.min()) if seen.n > 2 else 0, 0)
 
 
-def _open_directions(seen: Seen, frame: Frame, kernels: Table, workers: int) -> tuple[int, float]:
+def _open_directions(
+    seen: Seen, frame: Frame, kernels: Table, workers: int
+) -> tuple[int, int, float]:
     """Return how many directions beside the gauge N leaves open, and its least other eigenvalue.
+
+    Those of the cameras, and those of single points, which spoil nothing else.
 
     In parameters in which W of the covariant damping is one, for which the basis does not matter.
     """
@@ -164,12 +174,12 @@ def _open_directions(seen: Seen, frame: Frame, kernels: Table, workers: int) -> 
         system = problem.linearize(BundleState(P, Q, 0.0, problem))
         return _measured(system, problem, P, Q)
     except np.linalg.LinAlgError:
-        return 1, 0.0
+        return 1, 0, 0.0
 
 
 def _measured(
     system: BundleSystem, problem: BundleProblem, P: Array, Q: Array
-) -> tuple[int, float]:
+) -> tuple[int, int, float]:
     W = Covariant().matrix(system)  # type: ignore[arg-type]
     # A point whose lines of sight are one leaves W singular, too.
     lifted = [blocks + 1e-12 * _mean_diagonal(blocks) * np.eye(blocks.shape[1]) for blocks in W]
@@ -196,7 +206,7 @@ def _measured(
                 break
             columns *= 4
     open_cameras = int(np.count_nonzero(values <= _ROUNDING))
-    return open_cameras + open_points, float(max(values[0], 0.0))
+    return open_cameras, open_points, float(max(values[0], 0.0))
 
 
 def _freedom(kernels: Table, P: Array, Q: Array, roots: list[Array]) -> tuple[Array, Array, Array]:
@@ -230,13 +240,15 @@ def _least(shifted: Reduced, shift: float, moves: Array, columns: int) -> Array:
 
 def _grounded(V: Array) -> tuple[int, Array]:
     """Return how many directions of single points are open, and the blocks with these closed."""
-    factors = np.linalg.cholesky(V + 1e-14 * np.eye(4))
-    diagonal = np.einsum("nii->ni", factors)
-    thin = np.flatnonzero(diagonal.min(axis=1) ** 2 <= 1e3 * _ROUNDING)
+    try:
+        diagonal = np.einsum("nii->ni", np.linalg.cholesky(V + 1e-14 * np.eye(4)))
+        thin = np.flatnonzero(diagonal.min(axis=1) ** 2 <= 1e3 * _ROUNDING)
+    except np.linalg.LinAlgError:  # some block is singular to rounding: all are looked at
+        thin = np.arange(len(V))
     values, vectors = np.linalg.eigh(V[thin])
     open_ = values <= _ROUNDING
     V = V.copy()
-    V[thin] += (vectors * open_[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    V[thin] = (vectors * np.where(open_, 1.0, values)[:, None]) @ np.swapaxes(vectors, 1, 2)
     return int(np.count_nonzero(open_)), V
 
 

@@ -1,0 +1,169 @@
+"""What most observations agree on, among gross errors: a pair of views, a camera, points.
+
+Each is proposed from few observations, drawn again and again, and judged by all: the best proposal
+is the one that leaves half of the distances smallest. What follows starts from it with a robust
+loss.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.errors import ArgumentError
+from epigauge.kernels import Table
+from epigauge.multi_view.problem import BundleProblem
+from epigauge.multi_view.system import Layout
+from epigauge.scatter import spread
+from epigauge.two_view.conditioning import condition
+from epigauge.two_view.consensus import Consensus
+from epigauge.two_view.losses import Loss
+
+__all__ = ["agreed_camera", "agreed_fundamental", "agreed_points"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+#: Cameras are proposed from so many points, each size so often, and judged by so many points.
+_SIZES, _DRAWS, _JUDGES = (6, 8, 12), 120, 500
+
+#: Standard deviations of matches, as shares of the extent of the images, that a search begins with.
+_SIGMAS = (0.1, 0.01, 0.001)
+
+#: A match agrees within so many standard deviations.
+_AGREES = 4.0
+
+#: Pairs of observations that propose a point.
+_PAIRS = 12
+
+
+def agreed_fundamental(kernels: Table, x1: Array, x2: Array) -> tuple[Array, Mask]:
+    """Return the F that most matches agree on, and which do.
+
+    Parameters
+    ----------
+    kernels : Table
+        Backend.
+    x1, x2 : ndarray, shape (m, 2)
+        Matches, at least eight.
+
+    Returns
+    -------
+    F : ndarray, shape (3, 3)
+        Fundamental matrix.
+    agrees : ndarray of bool, shape (m,)
+        Matches within four standard deviations.
+
+    Raises
+    ------
+    ArgumentError
+        Where fewer than eight matches agree.
+    """
+    frame = condition(x1, x2)
+    consensus = Consensus(kernels, *frame.forward(x1, x2))
+    F = consensus.linear_fits(np.ones((1, consensus.products.shape[1])))[0]
+    starts = [consensus.judge(F, sigma) for sigma in _SIGMAS]
+    found = consensus.search(starts, np.random.default_rng(0))
+    agrees = found.inliers(_AGREES * max(found.sigma, 1e-9))
+    if np.count_nonzero(agrees) < 8:
+        raise ArgumentError("x1, x2", "agree on no epipolar geometry", "matches that do")
+    return frame.to_pixels(found.F), agrees
+
+
+def agreed_camera(q: Array, Q: Array) -> Array:
+    """Return the camera that leaves half of the points closest to their measurements.
+
+    Parameters
+    ----------
+    q, Q : ndarray, shape (2, c), (4, c)
+        At least six measurements and points.
+
+    Returns
+    -------
+    ndarray, shape (3, 4)
+        A camera of unit norm, to be refined.
+    """
+    rng = np.random.default_rng(0)
+    points, T = spread(Q.T)
+    few = np.sort(rng.permutation(len(points))[:_JUDGES])
+    X, x = points[few], q.T[few]
+    # Rows of the equations (X, 0, -x X) and (0, X, -y X), summed as products of three factors.
+    square = X[:, :, None] * X[:, None, :]
+    weights = np.stack([np.ones(len(X)), *x.T, np.sum(x**2, axis=1)], axis=1)
+    blocks = (weights[:, :, None, None] * square[:, None]).reshape(len(X), -1)
+    best, least = np.zeros((3, 4)), np.inf
+    for size in _SIZES:
+        size = min(size, len(X))
+        drawn = np.argsort(rng.random((_DRAWS, len(X))), axis=1)[:, :size]
+        sums = blocks[drawn].sum(axis=1).reshape(_DRAWS, 4, 4, 4)
+        cameras = _least_algebraic(sums)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            h = cameras @ X.T
+            squared = np.sum((h[:, :2] / h[:, 2:] - x.T) ** 2, axis=1)
+        # Half of the points, those that a camera is drawn from being right by construction.
+        rank = min((len(X) + size + 1) // 2, len(X) - 1)
+        middle = np.partition(np.nan_to_num(squared, nan=np.inf), rank, axis=1)[:, rank]
+        if middle.min() < least:
+            best, least = cameras[np.argmin(middle)], float(middle.min())
+    P = best @ np.linalg.inv(T)
+    return np.asarray(P / np.linalg.norm(P))
+
+
+def _least_algebraic(sums: Array) -> Array:
+    """Return cameras (k, 3, 4) from the sums of X X^T times 1, x, y and x^2 + y^2."""
+    N = np.zeros((len(sums), 12, 12))
+    N[:, :4, :4] = N[:, 4:8, 4:8] = sums[:, 0]
+    N[:, :4, 8:] = N[:, 8:, :4] = -sums[:, 1]
+    N[:, 4:8, 8:] = N[:, 8:, 4:8] = -sums[:, 2]
+    N[:, 8:, 8:] = sums[:, 3]
+    return np.asarray(np.linalg.eigh(N)[1][:, :, 0].reshape(-1, 3, 4))
+
+
+def agreed_points(problem: BundleProblem, P: Array, Q: Array, scale: float) -> Array:
+    """Return points, each where a pair of its lines of sight meets if that suits the others more.
+
+    Parameters
+    ----------
+    problem : BundleProblem
+        The observations.
+    P, Q : ndarray, shape (n, 3, 4), (m, 4)
+        Cameras, and points to begin from.
+    scale : float
+        Distance, in the unit of the problem, at which an observation is doubtful: one loss for all.
+
+    Returns
+    -------
+    ndarray, shape (m, 4)
+        Points of least Cauchy loss among those proposed, refined.
+    """
+    judge = BundleProblem(
+        problem.kernels,
+        problem.layout,
+        problem.q,
+        problem.weights,
+        Loss("cauchy", scale),
+        workers=problem.workers,
+    )
+    layout, rng = problem.layout, np.random.default_rng(0)
+    first, lengths = layout.first[:-1], np.diff(layout.first)
+    best, least = Q, _finite(judge.point_costs(P, Q))
+    for k in range(-1, _PAIRS):
+        if k < 0:
+            proposed = judge.engine.intersected(P)
+        else:
+            one = rng.integers(0, lengths)
+            two = (one + rng.integers(1, np.maximum(lengths, 2))) % lengths
+            rows = np.sort(np.column_stack([first + one, first + two]), axis=1).ravel()
+            alone = Layout(layout.view[rows], layout.point[rows], layout.n_views, layout.n_points)
+            q = np.ascontiguousarray(problem.q[:, rows])
+            pair = BundleProblem(problem.kernels, alone, q, np.ones(len(rows)), Loss())
+            proposed = pair.engine.intersected(P)
+        costs = _finite(judge.point_costs(P, proposed))
+        better = costs < least
+        best, least = np.where(better[:, None], proposed, best), np.where(better, costs, least)
+    return judge.triangulated(P, np.ascontiguousarray(best))
+
+
+def _finite(costs: Array) -> Array:
+    return np.nan_to_num(costs, nan=np.inf)

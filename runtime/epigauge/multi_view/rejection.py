@@ -1,0 +1,198 @@
+"""Adjustment of tracks with gross errors: robust steps, then least squares without what is wrong.
+
+A robust loss finds the geometry that most observations agree on; what is far from it is set aside,
+and the rest is adjusted as if it had been clean. What is set aside is asked again after each
+adjustment, until the verdict stays the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.kernels import Table
+from epigauge.multi_view.agreement import agreed_points
+from epigauge.multi_view.gauge import normalized
+from epigauge.multi_view.initialize import Frame
+from epigauge.multi_view.problem import BundleProblem
+from epigauge.multi_view.system import Layout
+from epigauge.multi_view.tracks import MIN_VIEWS, Reconstruction, Tracks
+from epigauge.two_view.losses import EFFICIENT, Loss, median
+
+if TYPE_CHECKING:
+    from epigauge.multi_view.adjust import BundleResult
+
+__all__ = ["Adjust", "without_gross_errors"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: Median distance of two normal coordinates of standard deviation one.
+_MEDIAN = 1.1774
+
+#: An observation is a gross error beyond this many standard deviations: none in ten million of
+#: normal ones, but measured ones have heavier tails.
+_GROSS = 6.0
+
+#: Robust adjustments at most, the decrease of the median distance that asks for another, and
+#: rounds of setting aside.
+_ROBUST_ROUNDS, _LOWER, _ROUNDS = 8, 0.99, 12
+
+#: The set aside is settled when less than this share of the observations changes sides.
+_SETTLED = 1e-3
+
+
+#: A point is at the centre of a camera where its image, both of unit norm in the normalised basis,
+#: is this small.
+_AT_CENTRE = 1e-3
+
+
+class Adjust(Protocol):
+    """Adjusts tracks from a start, with a loss; what else is asked for is settled."""
+
+    def __call__(
+        self, tracks: Tracks, start: Any, *, loss: str, loss_scale_px: float | str
+    ) -> BundleResult:
+        """Return the result."""
+
+
+def without_gross_errors(
+    adjust: Adjust, tracks: Tracks, start: Any, kernels: Table, loss: tuple[str, float | str]
+) -> BundleResult:
+    """Adjust tracks some of which are wrong.
+
+    Parameters
+    ----------
+    adjust : callable
+        An adjustment with the options asked for.
+    tracks : Tracks
+        Observations.
+    start : Reconstruction or MetricReconstruction
+        Where to begin.
+    kernels : Table
+        Backend.
+    loss : tuple
+        Name and scale of the loss of the last adjustments, of the observations that are kept.
+
+    Returns
+    -------
+    BundleResult
+        The last adjustment, with what was set aside in `rejected`.
+    """
+    search = _Search(tracks, kernels)
+    typical = np.inf
+    for _ in range(_ROBUST_ROUNDS):
+        found = adjust(tracks, start, loss="cauchy", loss_scale_px="auto")
+        if found.status == -2:
+            return found
+        start = search.agreed(found.reconstruction)
+        before, typical = typical, search.typical(start)
+        if not typical < _LOWER * before:
+            break
+    start, rejected = found.reconstruction, search.gross(found.reconstruction)
+    for _ in range(_ROUNDS):
+        kept = search.without(rejected)
+        begun = search.out_of_the_way(start, rejected)
+        found = adjust(kept, begun, loss=loss[0], loss_scale_px=loss[1])
+        found = search.restored(found, start, rejected)
+        found = replace(found, rejected=rejected, message=_told(found.message, rejected))
+        start, told = found.reconstruction, search.gross(found.reconstruction)
+        if found.status == -2 or np.mean(told != rejected) < _SETTLED:
+            break
+        rejected = told
+    return found
+
+
+def _told(message: str, rejected: Mask) -> str:
+    """Return a message that tells of what was set aside."""
+    count = int(np.count_nonzero(rejected))
+    share = f"{count} of {len(rejected)} observations set aside as gross errors"
+    return f"{message}; {share if count else 'nothing set aside'}"
+
+
+class _Search:
+    """Tracks, and what is asked of them again and again."""
+
+    def __init__(self, tracks: Tracks, kernels: Table) -> None:
+        self.tracks, self.frame = tracks, Frame.of(tracks)
+        self.counts = tracks.weights > 0.0
+        layout = Layout(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+        q, weights = self.frame.conditioned(tracks), np.asarray(tracks.weights)
+        self.problem = BundleProblem(kernels, layout, q, weights, Loss())
+
+    def distances(self, found: Any) -> Array:
+        """Return the distance of each observation, (N,),  times the root of its weight."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            d = np.linalg.norm(self.tracks.xy - found.project(self.tracks), axis=1)
+        return np.asarray(np.nan_to_num(np.sqrt(self.tracks.weights) * d, nan=np.inf))
+
+    def typical(self, found: Any) -> float:
+        """Return the median distance of what counts."""
+        return median(self.distances(found)[self.counts])
+
+    def agreed(self, found: Any) -> Any:
+        """Return the reconstruction with points where most of their observations want them.
+
+        Metric ones stay as they are: points that are proposed would be on any side of the cameras.
+        """
+        if not isinstance(found, Reconstruction):
+            return found
+        scale = EFFICIENT["cauchy"] * max(self.typical(found) / _MEDIAN / self.frame.scale, 1e-12)
+        P = self.frame.cameras_in(found.P)
+        return Reconstruction(found.P, agreed_points(self.problem, P, found.Q, scale))
+
+    def gross(self, found: Any) -> Mask:
+        """Return which observations are gross errors, or all that is left of a point to one."""
+        distances = self.distances(found)
+        limit = _GROSS * max(median(distances[self.counts]) / _MEDIAN, 1e-12 * self.frame.scale)
+        gross = self.counts & ((distances > limit) | self._at_centre(found))
+        kept = self.counts & ~gross
+        lengths = np.bincount(self.tracks.point[kept], minlength=self.tracks.n_points)
+        return np.asarray(gross | (self.counts & (lengths < MIN_VIEWS)[self.tracks.point]))
+
+    def _at_centre(self, found: Any) -> Mask:
+        """Return which observations are of points that have moved into the camera's centre.
+
+        Such a point fits any observation: what two views say of it has nothing in common.
+        """
+        if not isinstance(found, Reconstruction):
+            return np.zeros(len(self.counts), dtype=np.bool_)
+        P = self.frame.cameras_in(found.P)
+        P, Q = normalized().transformation(P, found.Q).apply(P, found.Q)
+        P /= np.linalg.norm(P, axis=(1, 2), keepdims=True)
+        Q /= np.linalg.norm(Q, axis=1, keepdims=True)
+        h = np.einsum("nij,nj->ni", P[self.tracks.view], Q[self.tracks.point])
+        return np.asarray(np.linalg.norm(h, axis=1) < _AT_CENTRE)
+
+    def lost(self, rejected: Mask) -> Mask:
+        """Return which points have nothing left."""
+        kept = np.bincount(self.tracks.point[~rejected], minlength=self.tracks.n_points)
+        return np.asarray(kept == 0)
+
+    def out_of_the_way(self, found: Any, rejected: Mask) -> Any:
+        """Return the reconstruction with points that nothing is left of where the best seen one is.
+
+        They have no weight, but near a focal plane they would stop every step.
+        """
+        if not isinstance(found, Reconstruction):
+            return found
+        kept = np.bincount(self.tracks.point[~rejected], minlength=self.tracks.n_points)
+        lost = self.lost(rejected)[:, None]
+        return Reconstruction(found.P, np.where(lost, found.Q[np.argmax(kept)], found.Q))
+
+    def restored(self, found: BundleResult, before: Any, rejected: Mask) -> BundleResult:
+        """Return the result with such points where they were before."""
+        if not isinstance(before, Reconstruction):
+            return found
+        Q = np.where(self.lost(rejected)[:, None], before.Q, found.reconstruction.Q)
+        reconstruction = Reconstruction(found.reconstruction.P, Q)
+        fun = self.tracks.xy - reconstruction.project(self.tracks)
+        return replace(found, reconstruction=reconstruction, fun=fun)
+
+    def without(self, rejected: Mask) -> Tracks:
+        """Return the tracks with weight zero for what is set aside."""
+        tracks = self.tracks
+        return tracks.weighted(np.where(rejected, 0.0, tracks.weights))
