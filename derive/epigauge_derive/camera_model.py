@@ -146,7 +146,7 @@ class CameraModel:
     depth : callable
         ``depth(h)``: positive in front of the camera.
     constants : tuple of str
-        Parameters that are given once and never adjusted: no unknown belongs to them.
+        The last parameters, if they are given once and never adjusted: they have no unknown.
     wrap : callable
         ``wrap(r, k)``: brings a residual to the nearest period, where the image has one.
     aliases : tuple of str
@@ -361,5 +361,7 @@ def camera_models() -> tuple[CameraModel, ...]:
         model = importlib.import_module(f"epigauge_derive.models.cameras.{name}").MODEL
         if model.prefix != name:
             raise ValueError(f"models/cameras/{name}.py: call the file {model.prefix}.py")
+        if (*model.adjusted, *model.constants) != tuple(model.parameters):
+            raise ValueError(f"models/cameras/{name}.py: the constants are the last parameters")
         found.append(model)
     return tuple(found)

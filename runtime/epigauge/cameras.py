@@ -48,7 +48,9 @@ class CameraModel:
     name, prefix : str
         Name, and what the names of its kernels begin with.
     params, units : tuple of str
-        Names of the parameters in their order, and units: ``"px"`` or ``"1"``.
+        Names of the parameters in their order, and units, as ``"px"`` or ``"1"``.
+    constants : tuple of str
+        The last of them, which are given and never adjusted, as the size of a spherical image.
     camera_size, tangent_size, point_size : int
         Numbers that a camera (12 of its pose, then the parameters), its update and a point consist
         of.
@@ -64,12 +66,18 @@ class CameraModel:
     prefix: str
     params: tuple[str, ...]
     units: tuple[str, ...]
+    constants: tuple[str, ...]
     camera_size: int
     tangent_size: int
     point_size: int
     gauge_dimension: int
     metric: bool
     homogeneous: bool
+
+    @property
+    def adjusted(self) -> tuple[str, ...]:
+        """Names of the parameters that can be refined: all but the constants, in order."""
+        return self.params[: len(self.params) - len(self.constants)]
 
     @property
     def focal(self) -> tuple[int, ...]:

@@ -140,7 +140,7 @@ class Priors:
             On anything but priors, and on priors on what does not exist; the message has their
             number.
         """
-        names = camera_model(start.cameras.model).params
+        names = camera_model(start.cameras.model).adjusted
         places: dict[type, list[tuple[int, Array, Array]]] = {PositionPrior: [], PointPrior: []}
         intrinsics: list[tuple[int, int, float, float]] = []
         for number, prior in enumerate(priors):

@@ -39,7 +39,7 @@ def refinable(refine: Any, cameras: Cameras) -> dict[str, Array]:
     ArgumentError
         On a name that the model does not have.
     """
-    names = camera_model(cameras.model).params
+    names = camera_model(cameras.model).adjusted
     unit = np.broadcast_to(np.eye(len(names)), (len(cameras), len(names), len(names)))
     known = {name: unit[:, k] for k, name in enumerate(names)}
     if "f" not in names and {"fx", "fy"} <= set(names):
@@ -103,7 +103,7 @@ def refined_freedom(
         raise ArgumentError(
             "refine", "leaves nothing: all views and points are fixed", "an unknown"
         )
-    k, q = cameras.params.shape[1], len(unknown)
+    k, q = len(camera_model(cameras.model).adjusted), len(unknown)
     directions = np.stack(list(unknown.values()), axis=2) if q else np.zeros((len(cameras), k, 0))
     of_view = directions[cameras.camera_of_view]
     views = np.bincount(cameras.camera_of_view, minlength=len(cameras))
@@ -145,7 +145,7 @@ def _check_priors(
     fixed_views: Indices,
     fixed_points: Indices,
 ) -> None:
-    names = camera_model(cameras.model).params
+    names = camera_model(cameras.model).adjusted
     free = np.zeros(len(names), np.bool_)
     for direction in unknown.values():
         free |= direction.any(axis=0)

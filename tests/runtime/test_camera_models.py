@@ -1,0 +1,67 @@
+"""Every metric camera model is adjusted by the one engine, without a line of its own."""
+
+from __future__ import annotations
+
+import epigauge as eg
+import numpy as np
+import pytest
+from epigauge.cameras import models
+from laws import distance, orthonormal
+
+METRIC = [name for name, model in models().items() if model.metric]
+#: Sizes of parameters in a network of unit focal length; what is not here is weak.
+SIZES = {"f": 1.1, "fx": 1.1, "fy": 1.05, "c": 1.2, "R0": 0.4, "width": 6.0, "height": 3.0}
+
+
+def network(name, seed, n=7, m=60):
+    """Return exact tracks and the scene: views all around a cloud of points."""
+    rng = np.random.default_rng(seed)
+    model = models()[name]
+    k = np.array([SIZES.get(p, 0.03 * rng.standard_normal()) for p in model.params])
+    X = rng.uniform(-1.0, 1.0, (m, 3))
+    R = np.array([orthonormal(rng) for _ in range(n)])
+    t = rng.uniform(-0.3, 0.3, (n, 3))
+    t[:, 2] += -4.0 if name in ("bal", "brown") else 4.0
+    scene = eg.MetricReconstruction(R, t, X, eg.Cameras(name, [k], [0] * n))
+    view, point = np.divmod(np.arange(n * m), m)
+    blank = eg.Tracks(view, point, np.zeros((n * m, 2)))
+    assert (scene.depths(blank) > 0.0).all()
+    return eg.Tracks(blank.view, blank.point, scene.project(blank)), scene
+
+
+def disturbed(scene, rng, refined):
+    """Return a start away from a scene: poses, points, and the parameters that are refined."""
+    turn = np.array(
+        [np.linalg.qr(np.eye(3) + 0.02 * rng.standard_normal((3, 3)))[0] for _ in scene.R]
+    )
+    turn *= np.sign(np.einsum("nii->ni", turn))[:, None, :]
+    params = scene.cameras.params.copy()
+    params[:, :refined] += 0.01 * rng.standard_normal(refined)
+    return eg.MetricReconstruction(
+        turn @ scene.R,
+        scene.t + 0.05 * rng.standard_normal(scene.t.shape),
+        scene.X + 0.05 * rng.standard_normal(scene.X.shape),
+        eg.Cameras(scene.cameras.model, params, scene.cameras.camera_of_view),
+    )
+
+
+@pytest.mark.parametrize("name", METRIC)
+def test_exact_images_lead_back_to_the_scene(name):
+    tracks, scene = network(name, 1)
+    start = disturbed(scene, np.random.default_rng(2), len(models()[name].adjusted))
+    result = eg.bundle_adjust(tracks, start)
+    assert result.success, result.message
+    assert result.reconstruction.rms_px(tracks) <= 1e-9 < 1e-3 < start.rms_px(tracks)
+    found = result.reconstruction.cameras.params
+    constant = len(models()[name].adjusted)
+    np.testing.assert_array_equal(found[:, constant:], scene.cameras.params[:, constant:])
+    if name not in ("FULL_OPENCV", "brown"):  # whose coefficients nearly replace each other
+        assert distance(found, scene.cameras.params) <= 1e-5
+
+
+@pytest.mark.parametrize("name", [name for name in METRIC if models()[name].constants])
+def test_constants_cannot_be_refined(name):
+    tracks, scene = network(name, 3)
+    constant = models()[name].constants[0]
+    with pytest.raises(eg.errors.ArgumentError, match=constant):
+        eg.bundle_adjust(tracks, scene, refine=(constant,))
