@@ -25,6 +25,7 @@ extensions = [
     "sphinx-mathjax-offline",
     "sphinx_design",
     "anchors",
+    "cameras",
     "formulas",
     "listings",
     "names",

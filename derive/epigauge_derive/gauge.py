@@ -109,12 +109,14 @@ def _evaluator(model: CameraModel) -> Callable[..., list[mpmath.matrix]]:
         for symbol, value in stage.values.items():
             values[symbol] = at(value, values)
         matrices = [at(matrix, values) for matrix in matrices]
-    return sp.lambdify([camera.entries(), X.entries()], matrices, modules="mpmath", cse=True)
+    functions = {"select": lambda condition, a, b: a if condition > 0 else b}
+    modules = [functions, "mpmath"]
+    return sp.lambdify([camera.entries(), X.entries()], matrices, modules=modules, cse=True)
 
 
 def _place(model: CameraModel, rng: random.Random) -> list[mpmath.mpf]:
     """Return a camera in general position."""
-    k = [mpmath.mpf(rng.uniform(0.4, 1.6)) for _ in model.parameters]
+    k = [mpmath.mpf(rng.uniform(0.02, 0.2)) for _ in model.parameters]
     if not model.frame.relations:
         return [mpmath.mpf(rng.uniform(-1, 1)) for _ in range(12)] + k
     S = mpmath.matrix(3, 3)
@@ -131,14 +133,20 @@ def _equations(
 ) -> Rows:
     """Return [J_camera, J_point B X by the entries of B] of one camera, two rows a point."""
     camera = _place(model, rng)
-    rows = []
-    for _ in range(model.tangent_size // 2 + 2 * model.point_size + 3):
+    wanted = 2 * (model.tangent_size // 2 + 2 * model.point_size + 3)
+    rows: Rows = []
+    for _ in range(20 * wanted):
         X = [mpmath.mpf(rng.uniform(-1, 1)) for _ in range(model.point_size)]
         J_camera, J_point = (matrix.tolist() for matrix in evaluate(camera, X))
         vector = [*X, mpmath.mpf(1)][:4]
         for own, by_point in zip(J_camera, J_point, strict=True):
-            rows.append([*own, *(slope * entry for slope in by_point for entry in vector)])
-    return rows
+            row = [*own, *(slope * entry for slope in by_point for entry in vector)]
+            # Not every point has an image: a root may be imaginary.
+            if all(isinstance(entry, mpmath.mpf) and mpmath.isfinite(entry) for entry in row):
+                rows.append(row)
+        if len(rows) >= wanted:
+            return rows
+    raise ValueError(f"{model.name}: points in general position have no image")
 
 
 def _reduced(rows: Rows, columns: int) -> tuple[list[int], Rows, Rows]:

@@ -24,6 +24,11 @@ class select(sp.Function):
 
     nargs = 3
 
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        """Return the derivative of the side that is taken."""
+        sides = {1: (0, 0), 2: (1, 0), 3: (0, 1)}[argindex]
+        return select(self.args[0], *map(sp.Integer, sides)) if argindex > 1 else sp.S.Zero
+
 
 class floor(sp.Function):
     """The largest whole number that is not above x; a step, of which no derivative is taken."""

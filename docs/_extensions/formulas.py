@@ -28,27 +28,32 @@ class Formula(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """Return the caption and the formula."""
-        (name,) = self.arguments
-        file = _GENERATED / f"{name}.tex"
-        if not file.is_file():
-            raise self.error(f"no kernel is named {name}: there is no {file.name} in {file.parent}")
-        self.env.note_dependency(str(file))
-        text = file.read_text()
-        header, _, body = text.partition("\\begin{align*}")
-        source, formula = _SOURCE.search(header), _FORMULA.search(header)
-        assert source, f"{file.name} does not name its source"
-        assert formula, f"{file.name} does not say what it is"
-        caption = nodes.paragraph(classes=["formula-caption"])
-        caption += nodes.strong(text=name)
-        said = " ".join(formula[1].replace("\n% ", " ").split())
-        caption += nodes.Text(f": {said} Derived in ")
-        caption += nodes.literal(text=source[1])
-        caption += nodes.Text(".")
-        latex = "\\begin{align*}" + body
-        math = nodes.math_block(latex, latex, classes=["formula"])
-        math["no-wrap"] = math["nowrap"] = True
-        math["number"] = None
-        return [caption, math]
+        return formula(self, self.arguments[0])
+
+
+def formula(directive: SphinxDirective, name: str) -> list[nodes.Node]:
+    """Return caption and formula of a kernel."""
+    file = _GENERATED / f"{name}.tex"
+    if not file.is_file():
+        where = file.parent
+        raise directive.error(f"no kernel is named {name}: there is no {file.name} in {where}")
+    directive.env.note_dependency(str(file))
+    text = file.read_text()
+    header, _, body = text.partition("\\begin{align*}")
+    source, sentence = _SOURCE.search(header), _FORMULA.search(header)
+    assert source, f"{file.name} does not name its source"
+    assert sentence, f"{file.name} does not say what it is"
+    caption = nodes.paragraph(classes=["formula-caption"])
+    caption += nodes.strong(text=name)
+    said = " ".join(sentence[1].replace("\n% ", " ").split())
+    caption += nodes.Text(f": {said} Derived in ")
+    caption += nodes.literal(text=source[1])
+    caption += nodes.Text(".")
+    latex = "\\begin{align*}" + body
+    math = nodes.math_block(latex, latex, classes=["formula"])
+    math["no-wrap"] = math["nowrap"] = True
+    math["number"] = None
+    return [caption, math]
 
 
 def setup(app: Sphinx) -> dict[str, object]:

@@ -298,6 +298,13 @@ def test_entry_with_a_name_that_is_taken_is_an_error(name):
         compile_kernel(toy(X, inputs=inputs))
 
 
+def test_derivative_of_a_branch_is_that_of_the_side_taken():
+    value = select(X - 1, X**2, sp.sin(X) * Y)
+    for x, expected in ((3.0, [6.0, 0.0]), (0.5, [2.0 * math.cos(0.5), math.sin(0.5)])):
+        found = run(toy(value.diff(X), value.diff(Y)), x, 2.0)
+        assert found == pytest.approx(expected, rel=1e-15)
+
+
 def test_pi_and_whole_numbers_below_are_printed():
     (value,) = run(toy(sp.pi * floor(X / sp.pi)), 7.0, 0.0)
     assert value == math.pi * 2.0
