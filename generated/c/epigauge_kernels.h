@@ -20,8 +20,11 @@
 #define EG_SIMD _Pragma("omp simd")
 #endif
 
-/* Digest of the sources: the same as C_DIGEST in epigauge_generated/signatures.py. */
+/* Digest of the generated sources: the same as DIGEST in epigauge_generated/c_backend. */
 EG_EXPORT const char *eg_digest(void);
+
+/* Digest of all sources that the library was built from, by CMakeLists.txt. */
+EG_EXPORT const char *eg_sources(void);
 
 EG_EXPORT void eg_block_fundamental(
     ptrdiff_t n,

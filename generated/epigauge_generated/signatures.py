@@ -46,8 +46,6 @@ class Model:
     homogeneous: bool
 
 
-C_DIGEST = "74b164d1656bc46c"
-
 SIGNATURES = {
     "block_fundamental": Signature(
         "block",

@@ -7,12 +7,14 @@ arithmetic is the same to the last bit, only sums over observations round differ
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import os
 from functools import cache
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
-from epigauge_generated.signatures import C_DIGEST
+from epigauge_generated.c_backend import DIGEST as C_DIGEST
 
 from epigauge.errors import ArgumentError, BackendError
 
@@ -40,7 +42,7 @@ def library() -> ctypes.CDLL:
     Raises
     ------
     BackendError
-        If there is none, or if it was built from other formulas than those of this installation.
+        If there is none, or if it was built from other sources than those of this installation.
     ArgumentError
         If the environment variable EPIGAUGE_PROCESSOR asks for a variant that there is not.
     """
@@ -108,10 +110,26 @@ def _files() -> dict[str, str]:
 
 
 def _loaded(path: str) -> ctypes.CDLL:
-    """Load a library and check that it was built from the formulas of this installation."""
+    """Load a library and check that it was built from the sources of this installation."""
     loaded = ctypes.CDLL(path)
     loaded.eg_digest.restype = ctypes.c_char_p
+    remedy = "install epigauge again to rebuild it"
     if loaded.eg_digest() != C_DIGEST.encode():
-        remedy = "install epigauge again to rebuild it"
         raise BackendError("c", "was built from other formulas", remedy)
+    loaded.eg_sources.restype = ctypes.c_char_p
+    sources = _sources()
+    if sources is not None and loaded.eg_sources() != sources.encode():
+        raise BackendError("c", "was built from other C sources than those beside it", remedy)
     return loaded
+
+
+@cache
+def _sources() -> str | None:
+    """Return the digest of all C sources as CMakeLists.txt makes it; None without a checkout."""
+    root = Path(__file__).resolve().parents[2]
+    files = [*root.glob("generated/c/*.[ch]"), *root.glob("runtime/c/*.[ch]")]
+    if not files or not (root / "CMakeLists.txt").is_file():
+        return None
+    files.sort(key=lambda path: path.relative_to(root).as_posix())
+    digests = "".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in files)
+    return hashlib.sha256(digests.encode()).hexdigest()

@@ -18,19 +18,21 @@ from epigauge_derive import __main__ as generator
 CHECKOUT = Path(__file__).resolve().parents[2]
 TUTORIAL = CHECKOUT / "docs" / "tutorials"
 
-#: Takes generated files from PYTHONPATH also where an editable install redirects imports.
-_PRELUDE = """
+#: Runs a module or a file; PYTHONPATH goes first also where an editable install redirects imports.
+_RUN = """
 import runpy, sys
 sys.meta_path[:] = [f for f in sys.meta_path if "Redirecting" not in type(f).__name__]
-runpy.run_path(sys.argv[1], run_name="__main__")
+sys.argv[:] = sys.argv[1:]
+run = runpy.run_path if sys.argv[0].endswith(".py") else runpy.run_module
+run(sys.argv[0], run_name="__main__")
 """
 
 
-def python(*arguments, paths):
-    """Run Python with folders before all others; return what it prints."""
+def run(*arguments, paths):
+    """Run a module or a file with folders before all others; return what it prints."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))}
     done = subprocess.run(
-        [sys.executable, *map(str, arguments)],
+        [sys.executable, "-c", _RUN, *map(str, arguments)],
         env=environment,
         capture_output=True,
         text=True,
@@ -49,7 +51,7 @@ def test_a_camera_model_is_one_file(tmp_path):
     added = derive / "epigauge_derive" / "models" / "cameras" / "division.py"
     added.write_text(model.code)
     assert len(model.code.splitlines()) <= 40
-    python("-m", "epigauge_derive", "--output", generated, paths=[derive])
+    run("epigauge_derive", "--output", generated, paths=[derive])
 
     old = CHECKOUT / "generated"
     changed = {
@@ -60,7 +62,12 @@ def test_a_camera_model_is_one_file(tmp_path):
     backends = {
         f"epigauge_generated/{name}_backend/cameras_division.py" for name in ("numpy", "casadi")
     }
-    tables = {"c/camera_models.c", "c/digest.c", "c/epigauge_kernels.h"}
+    tables = {
+        "epigauge_generated/c_backend/__init__.py",
+        "c/camera_models.c",
+        "c/digest.c",
+        "c/epigauge_kernels.h",
+    }
     assert backends | tables | {"c/cameras_division.c", "latex/division_observe.tex"} <= changed
     assert {name for name in changed if "division" not in name} == tables | {
         "epigauge_generated/signatures.py"
@@ -70,8 +77,6 @@ def test_a_camera_model_is_one_file(tmp_path):
             command = [compiler, "-std=c99", "-Wall", "-Wextra", "-Werror", "-fsyntax-only"]
             subprocess.run([*command, str(generated / "c" / name)], check=True)
 
-    printed = python(
-        "-c", _PRELUDE, TUTORIAL / "adjust_division.py", paths=[generated, CHECKOUT / "runtime"]
-    )
+    printed = run(TUTORIAL / "adjust_division.py", paths=[generated, CHECKOUT / "runtime"])
     said = (TUTORIAL / "camera.md").read_text().split("This prints `")[1].split("`")[0]
     documents.compare(printed, said, "adjust_division.py")

@@ -158,7 +158,7 @@ def test_a_changed_formula_changes_every_language_and_fails_the_check(
         "c/digest.c",
         "epigauge_generated/numpy_backend/orthonormal.py",
         "epigauge_generated/casadi_backend/orthonormal.py",
-        "epigauge_generated/signatures.py",
+        "epigauge_generated/c_backend/__init__.py",
         "latex/canonical_camera.tex",
     ):
         assert f"--- {name}" in printed, name

@@ -165,6 +165,22 @@ def test_library_of_other_formulas_is_refused_with_a_remedy(monkeypatch):
 
 
 @pytest.mark.usefixtures("built")
+def test_library_of_other_sources_is_refused_with_a_remedy(monkeypatch, tmp_path):
+    """In a checkout a changed loop of runtime/c is noticed like a changed formula."""
+    if _library._sources() is not None:
+        assert loader()()[1].eg_sources() == _library._sources().encode()
+    for folder in ("runtime/c", "generated/c", "runtime/epigauge"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "CMakeLists.txt").touch()
+    (tmp_path / "runtime/c/loop.c").write_text("int changed;")
+    monkeypatch.setattr(_library, "__file__", str(tmp_path / "runtime/epigauge/_library.py"))
+    monkeypatch.setattr(_library, "_sources", _library._sources.__wrapped__)
+    with pytest.raises(BackendError, match="other C sources") as error:
+        loader()()
+    assert "install" in error.value.remedy
+
+
+@pytest.mark.usefixtures("built")
 @pytest.mark.parametrize("name", _library.LEVELS.values())
 def test_variant_can_be_chosen_and_one_that_cannot_run_is_refused(monkeypatch, name):
     monkeypatch.setenv("EPIGAUGE_PROCESSOR", name)

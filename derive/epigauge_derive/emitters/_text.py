@@ -9,7 +9,8 @@ from collections.abc import Iterable, Sequence
 import sympy as sp
 
 from epigauge_derive.kernel import Input, Kernel, Output
-from epigauge_derive.program import Program
+from epigauge_derive.printer import Printer
+from epigauge_derive.program import Assignments, Program, Repeat
 
 WIDTH = 99
 
@@ -89,3 +90,19 @@ def mostly_zero(output: Output, results: Sequence[sp.Expr]) -> bool:
 def argument_names(kernel: Kernel) -> list[str]:
     """Return the names of inputs, then outputs."""
     return [argument.name for argument in (*kernel.inputs, *kernel.outputs)]
+
+
+def python_statement(statement: Assignments | Repeat, printer: Printer) -> list[str]:
+    """Return the lines of a statement in the body of a Python function."""
+
+    def assigned(assignments: Assignments, indent: str) -> list[str]:
+        return [f"{indent}{symbol.name} = {printer(value)}" for symbol, value in assignments]
+
+    if not isinstance(statement, Repeat):
+        return assigned(statement, "    ")
+    return [
+        *assigned(statement.start, "    "),
+        f"    for _ in range({statement.passes}):",
+        *assigned(statement.body, "        "),
+        *assigned(statement.states, "        "),
+    ]

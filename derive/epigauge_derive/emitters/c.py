@@ -71,11 +71,31 @@ _HEADER = """#ifndef EPIGAUGE_KERNELS_H
 #define EG_SIMD _Pragma("omp simd")
 #endif
 
-/* Digest of the sources: the same as C_DIGEST in epigauge_generated/signatures.py. */
+/* Digest of the generated sources: the same as DIGEST in epigauge_generated/c_backend. */
 EG_EXPORT const char *eg_digest(void);
+
+/* Digest of all sources that the library was built from, by CMakeLists.txt. */
+EG_EXPORT const char *eg_sources(void);
 
 """
 
+
+_DIGEST = """#include "epigauge_kernels.h"
+
+#ifndef EG_SOURCES
+#define EG_SOURCES ""
+#endif
+
+const char *eg_digest(void)
+{{
+    return "{digest}";
+}}
+
+const char *eg_sources(void)
+{{
+    return EG_SOURCES;
+}}
+"""
 
 _TABLE = """/* A camera model: sizes of camera, update and point, and its kernels. */
 typedef struct {
@@ -116,7 +136,7 @@ EG_EXPORT extern const eg_camera_model eg_camera_models[];
 
 
 def emit(programs: list[Program], models: Sequence[CameraModel] = ()) -> dict[str, str]:
-    """Write one source file a family, their common header, and the digest of them all."""
+    """Write one source file a family, header, table of models, and the digest of them all."""
     files = {}
     for family, members in families(programs).items():
         text = file_header(family, "/* {} */")
@@ -127,10 +147,10 @@ def emit(programs: list[Program], models: Sequence[CameraModel] = ()) -> dict[st
     header = file_header("", "/* {} */") + _HEADER + prototypes + _TABLE + "#endif\n"
     files["c/epigauge_kernels.h"] = header
     files["c/camera_models.c"] = _table(models)
-    files["c/digest.c"] = (
-        file_header("", "/* {} */")
-        + '#include "epigauge_kernels.h"\n\n'
-        + f'const char *eg_digest(void)\n{{\n    return "{digest(files)}";\n}}\n'
+    digest = _digest(files)
+    files["c/digest.c"] = file_header("", "/* {} */") + _DIGEST.format(digest=digest)
+    files["epigauge_generated/c_backend/__init__.py"] = (
+        file_header("", "# {}") + f"DIGEST = {quoted(digest)}\n"
     )
     return files
 
@@ -153,9 +173,9 @@ def _table(models: Sequence[CameraModel]) -> str:
     )
 
 
-def digest(files: dict[str, str]) -> str:
-    """Return the digest of the C sources, without the file that holds it."""
-    sources = "".join(files[name] for name in sorted(files) if name != "c/digest.c")
+def _digest(files: dict[str, str]) -> str:
+    """Return the digest of the C sources."""
+    sources = "".join(files[name] for name in sorted(files))
     return hashlib.sha256(sources.encode()).hexdigest()[:16]
 
 

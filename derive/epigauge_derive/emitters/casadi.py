@@ -15,11 +15,12 @@ from epigauge_derive.emitters._text import (
     file_header,
     kernel_header,
     module,
+    python_statement,
     quoted,
     used_entries,
 )
 from epigauge_derive.printer import Printer
-from epigauge_derive.program import Assignments, Program, Repeat
+from epigauge_derive.program import Program
 
 _printer = Printer(
     {
@@ -62,7 +63,7 @@ def _function(program: Program) -> str:
                 place = f"{position // columns}, {position % columns}"
                 lines.append(f"    {name} = {argument.name}[{place}]")
     for statement in program.statements:
-        lines += _statement(statement)
+        lines += python_statement(statement, _printer)
     for output, results in zip(kernel.outputs, program.results, strict=True):
         rows, columns = matrix_shape(output.shape)
         lines.append(f"    {output.name} = ca.SX({rows}, {columns})")
@@ -80,18 +81,3 @@ def _function(program: Program) -> str:
     for names in (inputs, outputs):
         lines.append(f"        [{', '.join(map(quoted, names))}],")
     return "\n".join([*lines, "    )"]) + "\n"
-
-
-def _statement(statement: Assignments | Repeat) -> list[str]:
-    if not isinstance(statement, Repeat):
-        return _assignments(statement, "    ")
-    return [
-        *_assignments(statement.start, "    "),
-        f"    for _ in range({statement.passes}):",
-        *_assignments(statement.body, "        "),
-        *_assignments(statement.states, "        "),
-    ]
-
-
-def _assignments(assignments: Assignments, indent: str) -> list[str]:
-    return [f"{indent}{symbol.name} = {_printer(value)}" for symbol, value in assignments]

@@ -13,10 +13,11 @@ from epigauge_derive.emitters._text import (
     kernel_header,
     module,
     mostly_zero,
+    python_statement,
     used_entries,
 )
 from epigauge_derive.printer import Printer
-from epigauge_derive.program import Assignments, Program, Repeat
+from epigauge_derive.program import Program
 
 _printer = Printer(
     {
@@ -51,7 +52,7 @@ def _function(program: Program) -> str:
             for _, index, name in used_entries(program, argument):
                 lines.append(f"    {name} = {argument.name}[{', '.join(map(str, index))}]")
     for statement in program.statements:
-        lines += _statement(statement)
+        lines += python_statement(statement, _printer)
     for output, results in zip(kernel.outputs, program.results, strict=True):
         sparse = mostly_zero(output, results)
         if sparse:
@@ -65,18 +66,3 @@ def _function(program: Program) -> str:
                 value = f"np.add.reduce({value}, axis=-1)"
             lines.append(f"    {output.name}[{place}] = {value}")
     return "\n".join(lines) + "\n"
-
-
-def _statement(statement: Assignments | Repeat) -> list[str]:
-    if not isinstance(statement, Repeat):
-        return _assignments(statement, "    ")
-    return [
-        *_assignments(statement.start, "    "),
-        f"    for _ in range({statement.passes}):",
-        *_assignments(statement.body, "        "),
-        *_assignments(statement.states, "        "),
-    ]
-
-
-def _assignments(assignments: Assignments, indent: str) -> list[str]:
-    return [f"{indent}{symbol.name} = {_printer(value)}" for symbol, value in assignments]

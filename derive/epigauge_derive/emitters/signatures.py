@@ -1,4 +1,4 @@
-"""The table of kernels that the runtime reads: arguments, shapes, digest of the C sources."""
+"""The tables of kernels and of camera models that the runtime reads."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import sympy as sp
 
 from epigauge_derive.camera_model import CameraModel
-from epigauge_derive.emitters import c
 from epigauge_derive.emitters._text import file_header, module, quoted
 from epigauge_derive.gauge import gauge
 from epigauge_derive.program import Program
@@ -78,7 +77,6 @@ def emit(programs: list[Program], models: Sequence[CameraModel] = ()) -> dict[st
             "    ),\n"
         )
     text = file_header("", "# {}") + _PROLOGUE
-    text += f"C_DIGEST = {quoted(c.digest(c.emit(programs, models)))}\n\n"
     text += "SIGNATURES = {\n" + "".join(rows) + "}\n\n"
     text += "MODELS = {\n" + "".join(map(_model, models)) + "}\n"
     package = file_header("", "# {}")
@@ -86,7 +84,6 @@ def emit(programs: list[Program], models: Sequence[CameraModel] = ()) -> dict[st
     return {
         "epigauge_generated/signatures.py": text,
         "epigauge_generated/__init__.py": package,
-        "epigauge_generated/c_backend/__init__.py": package,
         "epigauge_generated/py.typed": "",
         "provenance.toml": provenance,
     }
