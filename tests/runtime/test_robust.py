@@ -45,7 +45,7 @@ def error(F, scene) -> float:
 
 def consensus_of(x1, x2):
     frame = condition(x1, x2)
-    return frame, Consensus(kernels.table(), *frame.forward(x1, x2))
+    return frame, Consensus(kernels.table(), *frame.forward(x1, x2), np.inf)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.5])

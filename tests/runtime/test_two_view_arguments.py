@@ -168,7 +168,7 @@ def test_matches_that_count_must_not_be_on_one_line(weights) -> None:
 def test_start_value_allows_fewer_than_eight_matches_of_weight() -> None:
     w = (np.arange(50) < 7) * 1.0
     result = eg.refine_fundamental(X1, X2, F, weights=w)
-    assert result.success
+    assert result.status > 0
     d, _, _ = eg.reprojection_distances(F, X1, X2)
     assert result.cost < 0.1 * 0.5 * np.sum(w * d**2)
 

@@ -7,8 +7,10 @@ import dataclasses
 import epigauge as eg
 import numpy as np
 import pytest
+from epigauge.errors import ArgumentError
 from epigauge.lm import STATUS
 from epigauge.scenes import two_view_scene
+from epigauge.verdicts import usable
 from two_views import homogeneous, same_geometry
 
 FORMS = [
@@ -25,7 +27,7 @@ forms = pytest.mark.parametrize("form", FORMS, ids=lambda f: " ".join(f.values()
 def assert_no_nan(result: eg.FundamentalResult) -> None:
     """NaN nowhere; infinity in the covariance and the condition number only."""
     assert result.status in STATUS
-    assert result.success == (result.status > 0)
+    assert result.success == (result.status > 0 and usable(result.flags, "F"))
     for field in dataclasses.fields(result):
         value = getattr(result, field.name)
         if isinstance(value, np.ndarray | float):
@@ -91,9 +93,9 @@ class TestEpipoles:
         view = two_view_scene(6.0, noise_px=0.2, motion="forward", seed=seed)
         result = eg.refine_fundamental(view.x1, view.x2, max_iter=300, **form)
         # With points as unknowns the valley is too narrow for some: they must say so.
-        assert result.status == 0 or result.success
+        assert result.status >= 0
         if "structure" not in form:
-            assert result.success, result.message
+            assert result.status > 0, result.message
         assert_no_nan(result)
         d, _, _ = eg.reprojection_distances(view.F_true, view.x1, view.x2)
         assert result.cost < 0.5 * np.sum(d**2)
@@ -152,15 +154,15 @@ class TestFewMatches:
         view = two_view_scene(3.0, n_points=9, seed=2)
         x1, x2 = np.tile(view.x1, (3, 1)), np.tile(view.x2, (3, 1))
         result = eg.refine_fundamental(x1, x2, max_iter=300, **form)
-        assert result.success
         once = eg.refine_fundamental(view.x1, view.x2, max_iter=300, **form)
-        assert result.cost == pytest.approx(3 * once.cost, rel=1e-7)
+        assert result.cost == pytest.approx(once.cost, rel=1e-12)
 
     @forms
-    def test_seven_different_matches_do_not_determine_a_start_but_give_no_nan(self, form) -> None:
+    def test_seven_different_matches_are_too_few(self, form) -> None:
         view = two_view_scene(3.0, n_points=7, noise_px=0.3, seed=2)
         x1, x2 = np.tile(view.x1, (2, 1)), np.tile(view.x2, (2, 1))
-        assert_no_nan(eg.refine_fundamental(x1, x2, **form))
+        with pytest.raises(ArgumentError, match="hold 7 different matches; needed: at least 8"):
+            eg.refine_fundamental(x1, x2, **form)
 
 
 class TestStarts:
@@ -199,7 +201,9 @@ class TestDegenerateScenes:
         view = two_view_scene(5.0, seed=1)
         result = eg.refine_fundamental(view.x1, view.x1, **form)
         assert_no_nan(result)
-        assert result.success
+        assert result.status > 0
+        assert "still camera" in result.flags
+        assert "pure rotation" not in result.flags
         assert result.rms_px < 1e-12
         assert result.rank == 5
 
@@ -250,7 +254,7 @@ class TestHonesty:
         x1, x2 = np.vstack([view.x1, [0, 0]]), np.vstack([view.x2, [0, 0]])
         result = eg.refine_fundamental(x1, x2, view.F_true, max_iter=300)
         joint = eg.refine_fundamental(x1, x2, view.F_true, structure="joint", max_iter=300)
-        assert result.success
+        assert result.status > 0
         # The match in question has no derivative there: rounding decides which minimum is met.
         assert result.cost <= joint.cost * (1.0 + 1e-8)
 

@@ -98,7 +98,7 @@ def _timed(
     measured.cost.append(float(0.5 * d @ d))
     measured.error_px.append(float(np.sqrt(np.mean(true**2))))
     measured.evaluations.append(result.nfev if refined else 0)
-    measured.converged.append(bool(result.success) if refined else True)
+    measured.converged.append(result.status > 0 if refined else True)
     return F
 
 

@@ -12,7 +12,9 @@ class Partial:
     """Base of a dataclass whose instances may start with some of their fields only."""
 
     @classmethod
-    def partial(cls, known: dict[str, Any], complete: Callable[[], Any]) -> Self:
+    def partial(
+        cls, known: dict[str, Any], complete: Callable[[], Any], **cheaper: Callable[[], Any]
+    ) -> Self:
         """Return a result of which some fields are known and the rest is computed when asked for.
 
         Parameters
@@ -20,7 +22,10 @@ class Partial:
         known : dict
             Fields by name.
         complete : callable
-            Returns an object with the other fields; those that are known keep their values.
+            Returns an object with the other fields; those that are known keep their values. It may
+            be partial itself.
+        **cheaper : callable
+            The same for single fields that need not all the rest.
 
         Returns
         -------
@@ -28,21 +33,30 @@ class Partial:
             Pickling and copying completes it.
         """
         result = object.__new__(cls)
-        result.__dict__.update(known, _complete=complete)
+        result.__dict__.update(known, _complete=complete, _cheaper=cheaper)
         return result
 
     def __getattr__(self, name: str) -> Any:
         # Only called for what is not there yet.
-        complete = self.__dict__.get("_complete")
-        if complete is not None and name in type(self).__dataclass_fields__:  # type: ignore[attr-defined]
-            for field, value in complete().__dict__.items():
-                self.__dict__.setdefault(field, value)
-            self.__dict__.pop("_complete", None)
+        known = self.__dict__
+        if name in type(self).__dataclass_fields__:  # type: ignore[attr-defined]
+            cheaper = known.get("_cheaper", {}).get(name)
+            if cheaper is not None:
+                self._add(cheaper())
+            while name not in known and "_complete" in known:
+                # What completes it may be partial itself, and bring its own `_complete`.
+                more = known["_complete"]()
+                del known["_complete"]
+                self._add(more)
         try:
             return self.__dict__[name]
         except KeyError:
             kind = type(self).__name__
             raise AttributeError(f"{kind!r} object has no attribute {name!r}") from None
+
+    def _add(self, more: Any) -> None:
+        for field, value in more.__dict__.items():
+            self.__dict__.setdefault(field, value)
 
     def __getstate__(self) -> dict[str, Any]:
         fields = type(self).__dataclass_fields__  # type: ignore[attr-defined]

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,7 +87,7 @@ def assembled(
     fun = frame.scale * distances.signed
     grad = jac.T @ (weight * fun)
     motion, E = found.motion, _essential(F, options.calibration)
-    return FundamentalResult(
+    known = dict(  # noqa: C408
         F=F,
         U=factors.U,
         V=factors.V,
@@ -109,7 +112,6 @@ def assembled(
         nit=outcome.nit,
         status=outcome.status,
         message=lm.STATUS[outcome.status],
-        success=outcome.status > 0,
         history=outcome.history,
         minima=found.minima,
         ambiguous=found.ambiguous,
@@ -120,6 +122,12 @@ def assembled(
         _uncertainty=uncertainty,
         _evidence=found.evidence,
     )
+    return FundamentalResult.partial(known, partial(_judged, known))
+
+
+def _judged(known: dict[str, Any]) -> SimpleNamespace:
+    """Return flags and success of a result of which all else is known."""
+    return FundamentalResult.partial(known, SimpleNamespace).judged(known["_evidence"])
 
 
 def _corrected(solution: Solution, matches: Matches, noise: float) -> Solution:

@@ -16,6 +16,7 @@ from epigauge._arguments import as_array, as_count, as_matches, as_real, as_weig
 from epigauge.errors import ArgumentError
 from epigauge.two_view import native
 from epigauge.two_view._partial import Partial
+from epigauge.two_view.copies import counted_once
 from epigauge.two_view.express import completed
 from epigauge.two_view.refine import plan_of, refine_fundamental
 from epigauge.two_view.result import FundamentalResult
@@ -49,14 +50,14 @@ class FundamentalBatch(Partial):
     rank, nfev, njev, nit, status : ndarray of int, shape (n,)
         Per pair; `status` is that of `BATCH_STATUS`, -9 for a refused pair.
     success : ndarray of bool, shape (n,)
-        Whether `status` is positive.
+        Whether the pair may be used, as `FundamentalResult.success`; computed when asked for.
     distances : ndarray, shape (m,)
         Signed distances of all matches, in the order they were given.
     reasons : dict of int to str
         Why a pair was refused, by its number.
     flags : tuple of tuple of str
         What each pair's matches do not support, as `FundamentalResult.flags`; empty for refused
-        pairs, and for all where they were not asked for.
+        pairs. Computed when asked for.
     """
 
     F: Array
@@ -110,7 +111,7 @@ def refine_fundamental_batch(
     progress : callable, optional
         Called as ``progress(done, n)`` after every pair, from the calling thread.
     flags : bool
-        Diagnose every pair too, which takes about as long as a refinement.
+        Diagnose every pair at once, not when `flags` or `success` of the result is asked for.
     **options
         All other options of `refine_fundamental`, the same for every pair.
 
@@ -185,7 +186,7 @@ class _Work:
         options: dict[str, Any],
     ) -> None:
         self.x1, self.x2, self.bounds = x1, x2, bounds
-        self.starts, self.weights = starts, weights
+        self.starts, self.weights = starts, counted_once(x1, x2, weights, bounds)
         self.options, self.plan = options, plan_of(options)
         count = len(bounds) - 1
         self.known: dict[str, Any] = {
@@ -193,7 +194,6 @@ class _Work:
             **{name: np.zeros(count) for name in ("sigma", "cost", "rms_px")},
             **{name: np.zeros(count, dtype=np.intp) for name in ("nfev", "njev", "nit")},
             "status": np.full(count, REFUSED, dtype=np.intp),
-            "success": np.zeros(count, dtype=np.bool_),
             "distances": np.zeros(len(x1)),
         }
         self.reasons: dict[int, str] = {}
@@ -258,10 +258,18 @@ class _Work:
         # The caller may write into the arrays before the rest is computed.
         self.x1, self.x2 = self.x1.copy(), self.x2.copy()
         self.weights = None if self.weights is None else self.weights.copy()
-        count = len(known["F"])
-        diagnosed = (self._whole(k).flags if k not in self.reasons else () for k in range(count))
-        known["flags"] = tuple(diagnosed) if flags else ((),) * count
-        return FundamentalBatch.partial(known, self._rest)
+        if flags:
+            known |= self._judged().__dict__
+        return FundamentalBatch.partial(known, self._rest, flags=self._judged, success=self._judged)
+
+    def _judged(self) -> SimpleNamespace:
+        """Return flags and success of all pairs."""
+        count = len(self.known["F"])
+        wholes = [None if k in self.reasons else self._whole(k) for k in range(count)]
+        return SimpleNamespace(
+            flags=tuple(() if whole is None else whole.flags for whole in wholes),
+            success=np.array([whole is not None and whole.success for whole in wholes], np.bool_),
+        )
 
     def _rest(self) -> SimpleNamespace:
         """Return what takes longer than the refinement, neutral for pairs that were refused."""
@@ -310,5 +318,4 @@ def columns(pairs: native.Pair) -> dict[str, NDArray[Any]]:
             "njev": njev,
             "nit": nit,
             "status": status,
-            "success": status > 0,
         }

@@ -9,7 +9,7 @@ maxima; they are climbed from starts that subsets of the right matches give.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge.kernels import Table
 from epigauge.linear import Levenberg
+from epigauge.two_view.chance import CEILING
 from epigauge.two_view.conditioning import RMS
 from epigauge.two_view.criteria import Reprojection
 from epigauge.two_view.eliminated import EliminatedProblem
@@ -46,6 +47,15 @@ _SIZES = (8, 12, 20, 40)
 _SUBSETS = 75
 _CLIMBERS = 5
 _ROUNDS = 5
+
+#: Without a start: so many times the subsets of the smallest size, of which one in 256 is clean
+#: with half of the matches right; and the noise they are judged with, as shares of the range.
+_BLIND = 12
+_SIGMAS = (0.0003, 0.001, 0.003)
+
+#: What is found without a start is better by at least this logarithm of the likelihood: F of least
+#: squares with Gaussian noise is at the maximum already.
+_HIGHER = 5.0
 
 #: Subsets are drawn from, and judged by, about this many matches.
 _FEW = 2000
@@ -97,9 +107,15 @@ class Consensus:
         Backend.
     q1, q2 : ndarray, shape (2, m)
         Conditioned matches.
+    widest : float
+        Largest standard deviation of the noise of right matches. The default is where agreement of
+        raw matches begins to say nothing.
     """
 
-    def __init__(self, kernels: Table, q1: Array, q2: Array) -> None:
+    def __init__(
+        self, kernels: Table, q1: Array, q2: Array, widest: float = CEILING * RANGE / 3.0
+    ) -> None:
+        self.widest = widest
         self.criterion = Reprojection(kernels, q1, q2)
         self.block = Block(kernels)
         ones = np.ones((1, q1.shape[1]))
@@ -126,7 +142,7 @@ class Consensus:
             share = float(np.clip(count / len(squared), *_SHARES))
             # The seven parameters of F absorb seven squares of the noise
             variance = np.sum(right * squared) / max(count - 7.0, 1.0)
-            sigma = max(float(np.sqrt(variance)), _FLOOR)
+            sigma = min(max(float(np.sqrt(variance)), _FLOOR), self.widest)
 
     def climb(self, start: Agreement) -> Agreement:
         """Maximise the likelihood over F, sigma and share in turns."""
@@ -164,10 +180,26 @@ class Consensus:
             best = highest
         return best
 
-    def subset_fits(self, pool: NDArray[np.intp], rng: np.random.Generator) -> Array:
+    def better(self, own: Agreement, rng: np.random.Generator) -> Agreement:
+        """Search without a front end: from subsets of all matches, if they lead above an agreement.
+
+        Returns the agreement itself where they do not.
+        """
+        pool = np.arange(self.products.shape[1])
+        fits = self.subset_fits(pool, rng, _SIZES[:1] * _BLIND)
+        found = own
+        for sigma in _SIGMAS:
+            guess = replace(own, sigma=sigma * RANGE, share=0.5)
+            trial = self.judge(self.promising(fits, guess)[0], guess.sigma)
+            found = max(found, trial, key=_score)
+        return own if found.score <= own.score + _HIGHER else self.search([found], rng)
+
+    def subset_fits(
+        self, pool: NDArray[np.intp], rng: np.random.Generator, sizes: tuple[int, ...] = _SIZES
+    ) -> Array:
         """Return 8-point estimates from random subsets of a pool of the few, shape (k, 3, 3)."""
-        weights = np.zeros((_SUBSETS * len(_SIZES), self.products.shape[1]))
-        for k, size in enumerate(_SIZES):
+        weights = np.zeros((_SUBSETS * len(sizes), self.products.shape[1]))
+        for k, size in enumerate(sizes):
             order = np.argsort(rng.random((_SUBSETS, len(pool))), axis=1)[:, :size]
             rows = weights[k * _SUBSETS : (k + 1) * _SUBSETS]
             np.put_along_axis(rows, pool[order], 1.0, axis=1)

@@ -1,7 +1,9 @@
-"""What is the matter with a pair of images: named flags, each a test that the matches fail.
+"""What is the matter with a pair of images: flags, computed in one place for every entry.
 
 A refinement always returns some F. Whether the matches determine it is another question, which is
-answered here by comparing simpler models with it, and by the size of its covariance.
+answered here by comparing simpler models with it, and "all matches are wrong", and by the size of
+its covariance. Beside each significance stands an effect size, since real noise has heavy tails and
+is correlated: with enough matches everything is significant.
 """
 
 from __future__ import annotations
@@ -12,22 +14,27 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.kernels import Table
+from epigauge.two_view.chance import (
+    CEILING,
+    SIGNIFICANT,
+    chance_agreement,
+    independent,
+    log10_false_alarms,
+)
+from epigauge.two_view.consensus import RANGE, Consensus
 from epigauge.two_view.covariance import residual_noise
 from epigauge.two_view.criteria import Reprojection
 from epigauge.two_view.essential import Calibrated, Motion
+from epigauge.two_view.homography import fit_homography, robust_homography
+from epigauge.two_view.losses import robust_scale
 from epigauge.two_view.solve import Matches, Options, Solution
 from epigauge.verdicts import ordered
 
-__all__ = [
-    "Evidence",
-    "diagnose",
-    "evidence",
-    "fit_homography",
-    "is_oriented",
-    "without_chance_matches",
-]
+__all__ = ["Evidence", "diagnose", "evidence", "is_oriented"]
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 #: A redundancy below this estimates the noise worse than to 1 / sqrt(2 * 8) = 25 %.
 _REDUNDANCY = 8
@@ -41,10 +48,26 @@ _AFFINE = 11.34
 #: Standard deviations that count as within the noise.
 _WITHIN = 3.0
 
-#: Iterations of the robust homography, and the distance from it in standard deviations of the noise
-#: beyond which a match is off the plane: one right match in a hundred thousand.
-_ROBUST_ROUNDS = 20
+#: Distance from a homography, in standard deviations of the noise, beyond which a match is off the
+#: plane for Gaussian noise (one right match in a hundred thousand), and for real noise, which has
+#: heavy tails, is correlated, and has the relief of a facade beside it.
 _OFF_PLANE = 5.0
+_FAR_OFF = 8.0
+
+#: Nearly planar: no more than this share of the matches is far off the plane, and fewer than this
+#: number, with which the two parameters that a plane leaves are well determined.
+_FEW_OFF = 0.1
+_ENOUGH_OFF = 30
+
+#: The same share where matches are off the plane by less than this share of the range, RMS (5 px
+#: in an image of 1000): what small relief fixes says little of points at other depths. And the
+#: largest RMS that is relief, far matches counting as if they were eight deviations off.
+_FEW_OFF_FLAT = 0.25
+_FLAT = 0.005
+_RELIEF = 0.01
+
+#: Wrong matches that the epipole can be put through when all others are in one plane.
+_EPIPOLE = 2
 
 #: A noise below this, in conditioned coordinates, is rounding.
 _ROUNDING = 1e-8
@@ -54,87 +77,177 @@ _ROUNDING = 1e-8
 _AIC_RATIO = 1.5
 _NORMAL_99 = 2.326
 
+#: Least squares look suspicious beyond this noise, as a share of the range of the coordinates (2.5
+#: px in an image of 1000), or where matches beyond five robust deviations carry much of the error.
+_SUSPICIOUS = 0.0025
+_TAIL, _TAIL_SHARE = 5.0, 0.3
 
-@dataclass(frozen=True)
+#: Gross errors are told when the variance of least squares is so many times that of the matches
+#: that agree with the best F.
+_INFLATED = 2.0
+
+#: A camera stood still when no motion fits as well as the homography: by the 99 % quantile of
+#: chi-square with its 8 parameters, or to a twentieth of the variance of the noise.
+_CHI2_8 = 20.09
+_STILL = 0.05
+
+#: Coordinates that spread over less are hardly pixels.
+_PIXELS = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """A solution and the matches that count for it, in conditioned coordinates.
-
-    With a robust loss, those beyond three standard deviations do not count.
+    """A solution and the matches it is judged by, in conditioned coordinates.
 
     Attributes
     ----------
+    table : Table
+        Backend.
     F : ndarray, shape (3, 3)
         Estimate.
-    q1, q2, q1_hat, q2_hat : ndarray, shape (2, n)
-        Matches, measured and corrected.
+    all1, all2 : ndarray, shape (2, n)
+        All matches of positive weight, each of several equal ones once.
+    all_weights : ndarray, shape (n,)
+        Their weights.
+    inlier : ndarray of bool, shape (n,)
+        Which of them count for F.
+    limit : float
+        Largest distance at which a match counts.
+    searched : bool
+        Whether the inliers were chosen by F itself. Else the caller says that all are right.
     to_units1, to_units2 : ndarray, shape (3, 3)
         Maps of the images from pixels to these coordinates.
-    weights, squared : ndarray, shape (n,)
-        Weight and squared reprojection distance of each match.
     noise : float
-        Standard deviation of a coordinate, from the residuals.
+        Standard deviation of a coordinate, from the residuals of the inliers.
     parameters : int
         Number of parameters of F.
-    cameras : Calibrated or None
-        The same matches of calibrated cameras.
+    retina : bool
+        Whether the coordinates may be those on the retina, not pixels.
+    from_rays : tuple of ndarray, shape (3, 3) each, or None
+        Of calibrated cameras, the maps of the images from rays to these coordinates.
     n_behind : int
         Of calibrated cameras, the number of points behind one, by more than the noise explains.
     """
 
+    table: Table
     F: Array
-    q1: Array
-    q2: Array
-    q1_hat: Array
-    q2_hat: Array
+    all1: Array
+    all2: Array
+    all_weights: Array
+    inlier: Mask
+    limit: float
+    searched: bool
     to_units1: Array
     to_units2: Array
-    weights: Array
-    squared: Array
     noise: float
     parameters: int
-    cameras: Calibrated | None = None
+    retina: bool = False
+    from_rays: tuple[Array, Array] | None = None
     n_behind: int = 0
+
+    @cached_property
+    def q1(self) -> Array:
+        """Inliers in image 1, shape (2, m)."""
+        return np.ascontiguousarray(self.all1[:, self.inlier])
+
+    @cached_property
+    def q2(self) -> Array:
+        """Inliers in image 2, shape (2, m)."""
+        return np.ascontiguousarray(self.all2[:, self.inlier])
+
+    @cached_property
+    def weights(self) -> Array:
+        """Weights of the inliers, shape (m,)."""
+        return self.all_weights[self.inlier]
+
+    @cached_property
+    def _corrected(self) -> tuple[Array, Array, Array]:
+        """The inliers moved onto the epipolar geometry, and their squared distances."""
+        criterion = Reprojection(self.table, self.q1, self.q2)
+        feet = criterion.evaluate(self.F)
+        q1_hat, q2_hat, _ = criterion.corrected(feet)
+        return q1_hat, q2_hat, feet.squared
+
+    @property
+    def squared(self) -> Array:
+        """Squared reprojection distances of the inliers, shape (m,)."""
+        return self._corrected[2]
 
     @cached_property
     def oriented(self) -> bool:
         """Whether F satisfies the oriented epipolar constraint; of E, whether none is behind."""
-        if self.cameras is not None:
+        if self.from_rays is not None:
             return self.n_behind == 0
-        return is_oriented(self.F, self.q1_hat, self.q2_hat, self.noise)
+        return is_oriented(self.F, *self._corrected[:2], self.noise)
+
+    def among(
+        self, x1: Array, x2: Array, weights: Array, inlier: Mask, limit_px: float
+    ) -> Evidence:
+        """Return the evidence for the same F among other matches, chosen by F, in pixels."""
+        counts = weights > 0.0
+        inlier, weights, limit = inlier[counts], weights[counts], limit_px * self.to_units1[0, 0]
+        q1, q2 = (
+            np.ascontiguousarray((x[counts] * M[0, 0] + M[:2, 2]).T)
+            for x, M in ((x1, self.to_units1), (x2, self.to_units2))
+        )
+        found = replace(
+            self,
+            all1=q1,
+            all2=q2,
+            all_weights=weights,
+            inlier=inlier,
+            limit=float(limit),
+            searched=True,
+        )
+        squares = float(np.sum(found.weights * found.squared))
+        return replace(
+            found, noise=float(np.sqrt(squares / max(len(found.weights) - self.parameters, 1)))
+        )
+
+    @property
+    def rejected(self) -> int:
+        """Number of matches that do not count."""
+        return len(self.inlier) - int(np.count_nonzero(self.inlier))
 
 
 def evidence(
     matches: Matches, options: Options, solution: Solution, motion: Motion | None = None
 ) -> Evidence:
-    """Collect what the diagnosis of a solution needs."""
-    criterion = Reprojection(matches.table, matches.q1, matches.q2)
-    feet = criterion.evaluate(solution.F)
-    q1_hat, q2_hat, _ = criterion.corrected(feet)
+    """Collect what the diagnosis of a solution needs.
+
+    With a robust loss, matches beyond three standard deviations do not count.
+    """
+    counts = matches.weights > 0.0
+    q1, q2 = (np.ascontiguousarray(q[:, counts]) for q in (matches.q1, matches.q2))
+    weights = matches.weights[counts]
+    signed = Reprojection(matches.table, q1, q2).evaluate(solution.F).signed
     parameters = solution.chart.dimension
     loss = options.scaled_loss(solution.loss_scale_px / matches.frame.scale)
-    noise = residual_noise(feet.signed, matches.weights, loss, parameters)
-    counts = matches.weights > 0.0
+    noise = residual_noise(signed, weights, loss, parameters)
+    inlier = np.ones(len(weights), np.bool_)
     if loss.name != "linear":
-        counts &= np.sqrt(matches.weights) * np.abs(feet.signed) <= _WITHIN * noise
+        inlier = np.sqrt(weights) * np.abs(signed) <= _WITHIN * noise
     to_units1, to_units2 = matches.frame.maps_from_pixels()
-    cameras, n_behind = None, 0
-    if options.calibration is not None and motion is not None:
-        cameras = matches.calibrated(options.calibration).some(counts)
-        unexplained = matches.weights * motion.excess > (_WITHIN * noise) ** 2
-        n_behind = int(np.count_nonzero(counts & unexplained))
+    calibration, from_rays, n_behind = options.calibration, None, 0
+    if calibration is not None and motion is not None:
+        from_rays = (to_units1 @ calibration[0], to_units2 @ calibration[1])
+        unexplained = weights * motion.excess[counts] > (_WITHIN * noise) ** 2
+        n_behind = int(np.count_nonzero(inlier & unexplained))
     return Evidence(
+        table=matches.table,
         F=solution.F,
-        q1=matches.q1[:, counts],
-        q2=matches.q2[:, counts],
-        q1_hat=q1_hat[:, counts],
-        q2_hat=q2_hat[:, counts],
+        all1=q1,
+        all2=q2,
+        all_weights=weights,
+        inlier=inlier,
+        limit=_WITHIN * noise,
+        searched=loss.name != "linear",
         to_units1=to_units1,
         to_units2=to_units2,
-        weights=matches.weights[counts],
-        squared=feet.squared[counts],
         noise=noise,
         parameters=parameters,
-        cameras=cameras,
+        retina=calibration is not None and all(np.array_equal(K, np.eye(3)) for K in calibration),
+        from_rays=from_rays,
         n_behind=n_behind,
     )
 
@@ -158,13 +271,22 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
 
     Notes
     -----
-    With S the weighted sum of squared distances to F, S_H to a homography, S_A to an affine F, and
-    the noise s^2 = S / (n - p), the flags say
+    With S the weighted sum of squared distances to F, S_H to a homography, S_A to an affine F, S_I
+    to no motion at all, and the noise s^2 = S / (n - p), the flags say
 
+    - no common geometry: fewer than `chance.SIGNIFICANT` says of all geometries would agree so well
+      with wrong matches;
+    - gross errors: the geometry of highest likelihood under a mixture of right and wrong matches
+      leaves some far off, and the variance of those near it is less than half of s^2;
     - planar scene: ``S_H / (2 n - 8) <= max(1.5, F99) s^2``, with F99 the 99 % quantile of the
       ratio of two such variances. The bound 1.5 is that of the geometric AIC [1]_ for many matches,
       ``S_H + 2 (2 n + 8) s^2 <= S + 2 (3 n + p) s^2``; with few matches an F fits a plane better
-      than its 7 parameters promise, since its epipoles are free to move among the points;
+      than its 7 parameters promise, since its epipoles are free to move among the points. Matches
+      off the plane are left out where they are no more than agree by chance [2]_;
+    - nearly planar: of the matches that agree with F at most a tenth, and fewer than 30, are more
+      than 8 s from the homography that most are on, the others by one per cent of the range at
+      most, RMS; at most a quarter where all are within half a per cent, RMS;
+    - still camera: planar, and ``S_I - S_H <= max(20.1, 0.1 n) s^2``; in place of the former;
     - pure rotation: planar, and ``|tr H - tr H^-1|`` (det H = 1) within three standard deviations
       of zero: H = K R K^-1 has the eigenvalues of a rotation whatever K. Of calibrated cameras,
       planar, and the same bound holds for ``S_R / (2 n - 3)``, the rotation's;
@@ -176,73 +298,140 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     References
     ----------
     .. [1] K. Kanatani, "Geometric information criterion for model selection", IJCV 26(3), 1998.
+    .. [2] O. Chum, T. Werner, J. Matas, "Two-view geometry estimation unaffected by a dominant
+       plane", CVPR 2005.
     """
-    calibrated = found.cameras is not None
-    raised = {"ambiguous": ambiguous, "not oriented": not calibrated and not found.oriented}
-    raised["behind the cameras"] = calibrated and not found.oriented
-    n, p, noise2 = len(found.squared), found.parameters, max(found.noise, _ROUNDING) ** 2
-    S = float(np.sum(found.weights * found.squared))
-    H, squares, N_H = fit_homography(found.q1, found.q2, found.weights)
-    S_H = float(found.weights @ squares)
-    ratio = max(_AIC_RATIO, _variance_ratio_99(2 * n - 8, max(n - p, 4)))
-    raised["planar scene"] = (2 * n - 8) * ratio * noise2 >= S_H
-    if found.cameras is None:
-        turned = _may_be_rotation(found, H, N_H)
+    n, p = int(np.count_nonzero(found.inlier)), found.parameters
+    raised = {
+        "ambiguous": ambiguous,
+        "not oriented": found.from_rays is None and not found.oriented,
+        "behind the cameras": found.from_rays is not None and not found.oriented,
+        "weak geometry": not deviation <= _WEAK,
+        "few matches": n - p < _REDUNDANCY,
+        "not pixels": not found.retina and _extent(found) < _PIXELS,
+    }
+    judged = found
+    if not found.searched and _is_suspicious(found):
+        judged = _agreeing(found)
+        raised["gross errors"] = judged.searched and _is_inflated(found, judged)
+    few = raised["few matches"] and not found.searched  # too few to show anything: that is told
+    if judged.searched and not few and not _is_common(judged):
+        raised |= {"no common geometry": True, "gross errors": False}
     else:
-        S_R = float(found.weights @ found.cameras.from_rotation(found.weights))
-        turned = (2 * n - 3) * ratio * noise2 >= S_R
-    raised["pure rotation"] = raised["planar scene"] and turned
-    raised["near-affine"] = _affine_cost(found) <= S + _AFFINE * noise2
-    raised["weak geometry"] = not deviation <= _WEAK
-    raised["few matches"] = n - p < _REDUNDANCY
+        raised |= _plane(judged)
     return ordered(name for name, is_raised in raised.items() if is_raised)
 
 
-def without_chance_matches(found: Evidence, rejected: int, chance: float) -> Evidence:
-    """Leave out matches off a plane that are no more than wrong ones agree with F by chance.
+def _extent(found: Evidence) -> float:
+    """Return over how many pixels the points of an image spread, in either direction."""
+    widest = max(float(np.max(np.ptp(q, axis=1))) for q in (found.all1, found.all2))
+    return widest / float(found.to_units1[0, 0])
 
-    An F that fits a homography is free to move its epipole, and so to explain two wrong matches
-    more; of the others, some lie by chance on their epipolar lines. A few such matches would hide
-    that all the rest are in one plane [1]_.
 
-    Parameters
-    ----------
-    found : Evidence
-        Solution and inliers.
-    rejected : int
-        Number of matches that do not agree with F.
-    chance : float
-        Probability that a wrong match agrees.
+def _is_suspicious(found: Evidence) -> bool:
+    """Tell whether least squares may have been bent by gross errors: cheap, and often wrong."""
+    if found.noise > _SUSPICIOUS * RANGE:
+        return True
+    if found.noise <= _ROUNDING:
+        return False
+    squares = found.weights * found.squared
+    tail = squares > (_TAIL * robust_scale(np.sqrt(squares))) ** 2
+    return bool(np.sum(squares[tail]) > _TAIL_SHARE * np.sum(squares))
 
-    Returns
-    -------
-    Evidence
-        Without the matches off the plane, where these are no more than `_by_chance` says; else as
-        it was.
 
-    References
-    ----------
-    .. [1] O. Chum, T. Werner, J. Matas, "Two-view geometry estimation unaffected by a dominant
-       plane", CVPR 2005.
-    """
-    weights = found.weights
-    for _ in range(_ROBUST_ROUNDS):
-        _, squares, _ = fit_homography(found.q1, found.q2, weights)
-        scale2 = max(float(np.median(squares)), _ROUNDING**2)
-        weights = found.weights / (1.0 + squares / scale2) ** 2
-    on = found.weights * squares <= (_OFF_PLANE * max(found.noise, _ROUNDING)) ** 2
-    off = int(np.count_nonzero(~on))
-    if off == 0 or off > _by_chance(rejected + off, chance):
-        return found
+def _agreeing(found: Evidence) -> Evidence:
+    """Return the evidence for the geometry that most matches agree on, as if they were raw."""
+    consensus = Consensus(found.table, found.all1, found.all2, np.inf)
+    own = consensus.judge(found.F, found.noise, 0.9)
+    best = consensus.better(own, np.random.default_rng(0))
+    limit = max(best.mixture.even, _ROUNDING)
+    inlier = best.inliers(limit)
+    count = int(np.count_nonzero(inlier))
+    squares = np.sum(found.all_weights[inlier] * best.signed[inlier] ** 2)
     return replace(
         found,
-        q1=found.q1[:, on],
-        q2=found.q2[:, on],
-        q1_hat=found.q1_hat[:, on],
-        q2_hat=found.q2_hat[:, on],
-        weights=found.weights[on],
-        squared=found.squared[on],
+        F=best.F,
+        inlier=inlier,
+        limit=limit,
+        searched=True,
+        noise=float(np.sqrt(squares / max(count - found.parameters, 1))),
     )
+
+
+def _is_inflated(found: Evidence, judged: Evidence) -> bool:
+    """Tell whether a few matches far off the common geometry are most of the error."""
+    if not judged.rejected:
+        return False
+    return found.noise**2 > _INFLATED * max(judged.noise, _ROUNDING) ** 2
+
+
+def _is_common(found: Evidence) -> bool:
+    """Tell whether more matches agree with F than wrong ones would by chance."""
+    limit = min(found.limit, CEILING * RANGE)
+    near = found.squared <= limit**2
+    m, agreeing = len(found.inlier), int(np.count_nonzero(near))
+    if not agreeing:
+        return False
+    copies = agreeing - independent(found.q1[:, near], found.q2[:, near])
+    chance = chance_agreement(found.table, found.F, found.all1, found.all2, limit)
+    return log10_false_alarms(m - copies, agreeing - copies, chance) <= SIGNIFICANT
+
+
+def _plane(found: Evidence) -> dict[str, bool]:
+    """Return the flags about simpler models than F."""
+    noise2 = max(found.noise, _ROUNDING) ** 2
+    _, squares = robust_homography(found.q1, found.q2, found.weights)
+    squares = found.weights * squares
+    far = int(np.count_nonzero(squares > _FAR_OFF**2 * noise2))
+    relief = float(np.mean(np.minimum(squares, _FAR_OFF**2 * noise2)))
+    flat = float(np.mean(squares)) <= (_FLAT * RANGE) ** 2
+    few = (_FEW_OFF_FLAT if flat else _FEW_OFF) * len(squares)
+    nearly = relief <= (_RELIEF * RANGE) ** 2 and far <= few and far < _ENOUGH_OFF
+    on = _without_chance(found, squares <= _OFF_PLANE**2 * noise2)
+    q1, q2, weights = found.q1[:, on], found.q2[:, on], found.weights[on]
+    n, p = int(np.count_nonzero(on)), found.parameters
+    H, squares, N_H = fit_homography(q1, q2, weights)
+    S, S_H = float(weights @ found.squared[on]), float(weights @ squares)
+    ratio = max(_AIC_RATIO, _variance_ratio_99(max(2 * n - 8, 1), max(n - p, 4)))
+    planar = (2 * n - 8) * ratio * noise2 >= S_H
+    more = _displacement(found, q1, q2, weights) - S_H
+    if found.from_rays is None:
+        turned = _may_be_rotation(found, H, N_H)
+    else:
+        S_R = float(weights @ Calibrated(q1, q2, *found.from_rays).from_rotation(weights))
+        turned = (2 * n - 3) * ratio * noise2 >= S_R
+    still = planar and more <= max(_CHI2_8, 2 * n * _STILL) * noise2
+    return {
+        "still camera": still,
+        "planar scene": planar and not still,
+        "nearly planar": nearly and not planar,
+        "pure rotation": planar and not still and turned,
+        "near-affine": not still and _affine_cost(q1, q2, weights) <= S + _AFFINE * noise2,
+    }
+
+
+def _without_chance(found: Evidence, on: Mask) -> Mask:
+    """Return which inliers to judge a plane by: without those off it, if these agree by chance.
+
+    An F that fits a homography is free to move its epipole, and so to explain two wrong matches
+    more; where it was searched for among wrong matches, some of the others lie by chance on their
+    epipolar lines. A few such matches would hide that all the rest are in one plane.
+    """
+    off = len(on) - int(np.count_nonzero(on))
+    if off <= _EPIPOLE:
+        return on
+    if found.searched:
+        chance = chance_agreement(found.table, found.F, found.all1, found.all2, found.limit)
+        if off <= _by_chance(found.rejected + off, chance):
+            return on
+    return np.ones(len(on), np.bool_)
+
+
+def _displacement(found: Evidence, q1: Array, q2: Array, weights: Array) -> float:
+    """Return the weighted sum of squared distances to no motion at all, in pixels the same."""
+    origin = found.to_units2[:2, 2] - found.to_units1[:2, 2]
+    moved = q2 - q1 - origin[:, None]
+    return float(np.sum(weights * np.sum(moved**2, axis=0))) / 2.0
 
 
 def _by_chance(wrong: int, chance: float) -> int:
@@ -258,7 +447,7 @@ def _by_chance(wrong: int, chance: float) -> int:
         q += 1
         term *= mean / q
         tail -= term
-    return min(2 + q, wrong)
+    return min(_EPIPOLE + q, wrong)
 
 
 def is_oriented(F: Array, q1_hat: Array, q2_hat: Array, noise: float) -> bool:
@@ -299,43 +488,6 @@ def is_oriented(F: Array, q1_hat: Array, q2_hat: Array, noise: float) -> bool:
     return bool((signs > 0.0).all() or (signs < 0.0).all())
 
 
-def fit_homography(q1: Array, q2: Array, weights: Array) -> tuple[Array, Array, Array]:
-    """Fit q2 ~ H q1 by Sampson's weights: the reprojection error to first order.
-
-    Parameters
-    ----------
-    q1, q2 : ndarray, shape (2, n)
-        Conditioned matches.
-    weights : ndarray, shape (n,)
-        Weights of the squared distances.
-
-    Returns
-    -------
-    H : ndarray, shape (3, 3)
-        Homography of unit Frobenius norm.
-    squares : ndarray, shape (n,)
-        Squared distance of each match, in both images.
-    N : ndarray, shape (9, 9)
-        J^T J by vect(H).
-    """
-    n = q1.shape[1]
-    q = np.vstack([q1, np.ones(n)])
-    # Two equations a match, q2 (h3 q) - (h1 q, h2 q) = 0, linear in vect(H)
-    A = np.zeros((n, 2, 9))
-    A[:, 0, 0:3] = A[:, 1, 3:6] = -q.T
-    A[:, :, 6:9] = np.einsum("in,jn->nij", q2, q)
-    inverse = np.broadcast_to(np.eye(2), (n, 2, 2))
-    for _ in range(4):  # converges as the noise over the size of the scene
-        N = np.einsum("n,nia,nij,njb->ab", weights, A, inverse, A, optimize=True)
-        H = np.linalg.eigh(N)[1][:, 0].reshape(3, 3)
-        J1 = np.einsum("in,j->nij", q2, H[2, :2]) - H[:2, :2]
-        depth = H[2] @ q
-        squares = J1 @ J1.transpose(0, 2, 1) + depth[:, None, None] ** 2 * np.eye(2)
-        inverse = np.linalg.inv(squares + np.finfo(float).tiny * np.eye(2))
-    c = A @ H.ravel()
-    return H, np.einsum("ni,nij,nj->n", c, inverse, c), N
-
-
 def _variance_ratio_99(above: int, below: int) -> float:
     """Return the 99 % quantile of Fisher's F with degrees of freedom, below >= 4 (Paulson 1942)."""
     a, b = 2.0 / (9.0 * above), 2.0 / (9.0 * below)
@@ -363,14 +515,15 @@ def _may_be_rotation(found: Evidence, H: Array, N: Array) -> bool:
     by_G = np.eye(3) / root + root * (inverse @ inverse).T + by_log_determinant
     by_H = (same.T @ by_G).ravel()
     values, vectors = np.linalg.eigh(N)
+    values = np.maximum(values, np.finfo(float).eps * values[-1])
     variance = max(found.noise, _ROUNDING) ** 2 * np.sum(
         (vectors[:, 1:].T @ by_H) ** 2 / values[1:]
     )
     return bool(abs(trace - trace_inverse) <= _WITHIN * np.sqrt(variance))
 
 
-def _affine_cost(found: Evidence) -> float:
+def _affine_cost(q1: Array, q2: Array, weights: Array) -> float:
     """Return the weighted sum of squared distances to the best affine F, a plane in 4-space."""
-    z = np.vstack([found.q1, found.q2])
-    z = z - np.average(z, axis=1, weights=found.weights)[:, None]
-    return float(np.linalg.eigvalsh((found.weights * z) @ z.T)[0])
+    z = np.vstack([q1, q2])
+    z = z - np.average(z, axis=1, weights=weights)[:, None]
+    return float(np.linalg.eigvalsh((weights * z) @ z.T)[0])

@@ -77,7 +77,6 @@ def express(
         "nit": nit,
         "status": status,
         "message": lm.STATUS[status],
-        "success": status > 0,
     }
     # The caller may write into the arrays before the rest is computed.
     kept = None if weights is None else weights.copy()

@@ -27,6 +27,7 @@ from epigauge.errors import ArgumentError
 from epigauge.two_view import native
 from epigauge.two_view.assemble import assembled
 from epigauge.two_view.conditioning import condition
+from epigauge.two_view.copies import counted_once, earliest
 from epigauge.two_view.criteria import CRITERIA
 from epigauge.two_view.express import express
 from epigauge.two_view.five_point import essential_starts
@@ -66,7 +67,7 @@ def refine_fundamental(
     K2: ArrayLike | None = None,
     loss: str = "linear",
     loss_scale_px: float | str = "auto",
-    noise_px: float | None = 1.0,
+    noise_px: float | None = None,
     weights: ArrayLike | None = None,
     covariance1: ArrayLike | None = None,
     covariance2: ArrayLike | None = None,
@@ -86,8 +87,9 @@ def refine_fundamental(
     Parameters
     ----------
     x1, x2 : array_like, shape (m, 2)
-        At least eight matches in pixels without gross errors, five for an essential matrix; also
-        (m, 1, 2), any real type.
+        At least eight different matches in pixels without gross errors, five for an essential
+        matrix; also (m, 1, 2), any real type. Of several equal matches one counts, as if the others
+        had weight zero.
     F0 : array_like, shape (3, 3), optional
         Start value with ``x2^T F0 x1 = 0``, of any scale; by default `fundamental_8point`.
     parameterization : {"ortho", "block", "maps", "parfree", "free", "normalized"}
@@ -128,9 +130,9 @@ def refine_fundamental(
     loss_scale_px : float or "auto"
         Scale of the loss in pixels; by default a multiple of the noise as estimated from the
         residuals, anew until it stands still.
-    noise_px : float or None
-        Standard deviation of a coordinate in pixels, which scales the covariance only; None
-        estimates it from the residuals, as sqrt(sum(w d^2) / (m - p)), m the matches of weight
+    noise_px : float, optional
+        Standard deviation of a coordinate in pixels, which scales the covariance only. By default
+        it is estimated from the residuals, as sqrt(sum(w d^2) / (m - p)), m the matches of weight
         above 0 and p the parameters of F, and by their median with a robust loss.
     weights : array_like, shape (m,), optional
         Factor of each match's squared distance; for the covariance, (noise_px / standard deviation
@@ -197,7 +199,7 @@ def refine_fundamental(
     _check_combination(options)
     if starts > 1 and options.fix:
         raise ArgumentError("starts", f"is {starts} with fix", "1: the start holds what is fixed")
-    w = np.ones(len(x1)) if weights is None else as_weights(weights, len(x1))
+    w = _once(x1, x2, None if weights is None else as_weights(weights, len(x1)), least)
     if F0 is not None:
         start: Array | None = _given_start(F0, x1, x2, w)
     elif np.count_nonzero(w > 0.0) < least:
@@ -297,7 +299,7 @@ def _express(
     assert isinstance(x2, np.ndarray)
     if F0 is not None:
         F0 = np.ascontiguousarray(as_fundamental(F0))
-    w = None if weights is None else as_weights(weights, len(x1))
+    w = counted_once(x1, x2, None if weights is None else as_weights(weights, len(x1)))
     assert plan.native is not None
     return express(x1, x2, F0, w, plan.options, plan.native, plan.noise_px)
 
@@ -402,6 +404,17 @@ def _starts(matches: Matches, options: Options, start: Array | None, count: int)
         needed = "matches that determine an essential matrix"
         raise ArgumentError("x1, x2", "are in a degenerate position", needed)
     return first
+
+
+def _once(x1: Array, x2: Array, weights: Array | None, at_least: int) -> Array:
+    """Return weights with which equal matches count once; refuse too few different ones."""
+    once = counted_once(x1, x2, weights)
+    if once is None:
+        return np.ones(len(x1))
+    different = int(np.count_nonzero(earliest(x1, x2) == np.arange(len(x1))))
+    if different < at_least:
+        raise ArgumentError("x1, x2", f"hold {different} different matches", f"at least {at_least}")
+    return once
 
 
 #: Keyword options of `refine_fundamental` with their defaults, and those that a plan is made of.

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge import verdicts
 from epigauge.errors import ArgumentError
 from epigauge.lm import Row
 from epigauge.two_view._partial import Partial
@@ -72,8 +73,13 @@ class FundamentalResult(Partial):
         Reason for stopping as in `epigauge.lm.STATUS`; positive is success.
     message : str
         The same in words.
+    flags : tuple of str
+        What the matches do not support: names from `epigauge.verdicts.FLAGS`, which explains them;
+        the tests are in `epigauge.two_view.diagnostics.diagnose`. They use the noise of the
+        residuals. Computed when asked for.
     success : bool
-        Whether `status` is positive.
+        Whether the result may be used: `status` is positive, and no flag spoils it
+        (`epigauge.verdicts.usable`).
     history : tuple of Row
         One row an evaluation of the cost, of all starts one after the other.
     minima : tuple of Minimum
@@ -118,6 +124,7 @@ class FundamentalResult(Partial):
     nit: int
     status: int
     message: str
+    flags: tuple[str, ...]
     success: bool
     history: tuple[Row, ...] = field(repr=False)
     minima: tuple[Minimum, ...] = field(repr=False)
@@ -148,19 +155,14 @@ class FundamentalResult(Partial):
         """
         return self._uncertainty.of_sigma()
 
-    @cached_property
-    def flags(self) -> tuple[str, ...]:
-        """What the matches do not support, computed when asked for.
-
-        Names from `epigauge.verdicts.FLAGS`, which explains them; the tests are in
-        `epigauge.two_view.diagnostics.diagnose`. They use the noise of the residuals.
-        """
-        return self._flags(self._evidence)
-
-    def _flags(self, found: Evidence) -> tuple[str, ...]:
-        estimated_px = found.noise / found.to_units1[0, 0]
-        deviation = self._uncertainty.largest() * estimated_px / self.noise_px
-        return diagnose(found, deviation, self.ambiguous)
+    def judged(self, found: Evidence) -> SimpleNamespace:
+        """Return `flags` and `success` by some evidence."""
+        largest = self._uncertainty.largest()
+        if np.isfinite(largest) and self.noise_px > 0.0:
+            largest *= found.noise / found.to_units1[0, 0] / self.noise_px
+        flags = diagnose(found, largest, self.ambiguous)
+        usable = verdicts.usable(flags, "F" if self.E is None else "E")
+        return SimpleNamespace(flags=flags, success=self.status > 0 and usable)
 
     def epipole_covariance(self, image: int) -> Array:
         """Return the covariance (3, 3) of `epipole1` or `epipole2`, of rank 2.

@@ -7,7 +7,8 @@ import importlib.util
 import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields
-from functools import cached_property
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from epigauge import kernels
 from epigauge._arguments import as_choice, as_count, as_matches, as_positive
 from epigauge.errors import ArgumentError, MissingPackageError
+from epigauge.two_view.chance import CEILING
 from epigauge.two_view.conditioning import RMS, condition
 from epigauge.two_view.consensus import RANGE, Agreement, Consensus
-from epigauge.two_view.diagnostics import without_chance_matches
+from epigauge.two_view.copies import earliest
 from epigauge.two_view.initial import fundamental_8point
 from epigauge.two_view.losses import robust_scale
 from epigauge.two_view.refine import refine_fundamental
@@ -76,14 +78,6 @@ class RobustResult(FundamentalResult):
     threshold_px: float
     rounds: int
     start: str
-
-    @cached_property
-    def flags(self) -> tuple[str, ...]:
-        """As `FundamentalResult.flags`, robust against wrong matches that agree by chance."""
-        rejected = len(self.inlier) - int(np.count_nonzero(self.inlier))
-        # Wrong distances are taken as uniform over the range of the coordinates.
-        chance = min(2.0 * self.threshold_px * self._evidence.to_units1[0, 0] / RANGE, 1.0)
-        return self._flags(without_chance_matches(self._evidence, rejected, chance))
 
 
 def estimate_fundamental(
@@ -144,14 +138,11 @@ def estimate_fundamental(
     if "F0" in options:
         raise ArgumentError("F0", "is given", "refine_fundamental, which starts from it")
 
-    _, first, copies = np.unique(
-        np.column_stack([x1, x2]), axis=0, return_index=True, return_inverse=True
-    )
-    if len(first) < 8:
-        raise ArgumentError("x1, x2", f"hold {len(first)} different matches", "at least 8")
-    # In the caller's order, so that the draws of a front end do not depend on the values
-    order = np.argsort(first)
-    rows, copies = first[order], np.argsort(order)[copies.ravel()]
+    first = earliest(x1, x2)
+    rows = np.flatnonzero(first == np.arange(len(x1)))
+    if len(rows) < 8:
+        raise ArgumentError("x1, x2", f"hold {len(rows)} different matches", "at least 8")
+    copies = np.searchsorted(rows, first)
     y1, y2 = x1[rows], x2[rows]
 
     frame = condition(y1, y2)
@@ -162,7 +153,7 @@ def estimate_fundamental(
     agreement = consensus.search((a for _, a in starts), np.random.default_rng(seed))
 
     options.setdefault("noise_px", None)
-    limit = agreement.mixture.even if threshold is None else threshold / frame.scale
+    limit = threshold / frame.scale if threshold is not None else _at_most(agreement.mixture.even)
     inlier = agreement.inliers(limit)
     fitted: set[bytes] = set()
     while inlier.tobytes() not in fitted and len(fitted) < _ROUNDS:
@@ -181,14 +172,47 @@ def estimate_fundamental(
             sigma = robust_scale(agreement.signed[used])
             limit = min(limit, max(_DEVIATIONS * sigma, 1e-9))
         inlier = agreement.inliers(limit)
-    return RobustResult(
-        **{entry.name: getattr(refined, entry.name) for entry in fields(refined)},
-        inlier=used[copies],
-        used=rows[used],
-        threshold_px=limit_px,
-        rounds=len(fitted),
-        start=name,
+    known = {
+        entry.name: getattr(refined, entry.name)
+        for entry in fields(refined)
+        if entry.name not in ("flags", "success")
+    }
+    known |= {
+        "inlier": used[copies],
+        "used": rows[used],
+        "threshold_px": limit_px,
+        "rounds": len(fitted),
+        "start": name,
+    }
+    if threshold is None:  # real noise has heavier tails than three deviations of its core
+        limit = max(limit, _at_most(agreement.mixture.even))
+    weights = _of_matches(options, len(x1), rows).get("weights")
+    raw = _Raw(y1, y2, np.ones(len(y1)) if weights is None else np.asarray(weights, float))
+    agreeing = agreement.inliers(limit)
+    return RobustResult.partial(
+        known, partial(_judged, refined, raw, agreeing, limit * frame.scale)
     )
+
+
+@dataclass(frozen=True)
+class _Raw:
+    """All different matches in pixels, and their weights."""
+
+    x1: Array
+    x2: Array
+    weights: Array
+
+
+def _judged(
+    refined: FundamentalResult, raw: _Raw, agreeing: Mask, limit_px: float
+) -> SimpleNamespace:
+    """Return flags and success, by all matches: those that agree within a limit, and the others."""
+    return refined.judged(refined._evidence.among(raw.x1, raw.x2, raw.weights, agreeing, limit_px))
+
+
+def _at_most(limit: float) -> float:
+    """Return a threshold that was not given, no larger than where agreement says something."""
+    return float(min(limit, CEILING * RANGE))
 
 
 def _of_matches(options: dict[str, Any], m: int, rows: NDArray[np.intp]) -> dict[str, Any]:

@@ -1,0 +1,125 @@
+"""Whether matches agree with a geometry better than wrong ones do by chance.
+
+The best of all geometries always has some matches near it. With seven parameters it passes through
+any seven of m matches; each of the others, if it is wrong, lies within a distance T of it with a
+probability q. Of all C(m, 7) geometries the number that k or more matches agree with by chance is
+then expected to be
+
+    C(m, 7) P(Binomial(m - 7, q) >= k - 7),
+
+and an agreement is common geometry where that is far below one [1]_. This is the likelihood of the
+best F against "all wrong", with its degrees of freedom counted: no threshold on numbers of inliers.
+
+References
+----------
+.. [1] L. Moisan, B. Stival, "A probabilistic criterion to detect rigid point matches between two
+   images and estimate the fundamental matrix", IJCV 57(3), 2004.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.kernels import Table
+from epigauge.two_view.criteria import Reprojection
+
+__all__ = ["CEILING", "SIGNIFICANT", "chance_agreement", "independent", "log10_false_alarms"]
+
+Array = NDArray[np.float64]
+
+#: Largest distance of an inlier that is chosen without the caller, as a share of the range of the
+#: coordinates: 15 px in an image of 1000. Within more, wrong matches agree because both images have
+#: their features in similar places.
+CEILING = 0.015
+
+#: An agreement is no accident when fewer such are expected than 10 to this.
+SIGNIFICANT = -3.0
+
+#: Parameters of F.
+_FREE = 7
+
+#: Wrong pairs that chance is estimated from, and how many of them must lie within the distance.
+_PAIRS = 4000
+_WITHIN = 20
+
+
+def log10_false_alarms(m: int, k: int, chance: float) -> float:
+    """Return the logarithm of how many chance agreements of k of m matches are expected.
+
+    Parameters
+    ----------
+    m, k : int
+        Matches, and how many of them agree.
+    chance : float
+        Probability that a wrong match agrees.
+
+    Returns
+    -------
+    float
+        The logarithm to base 10, with Chernoff's bound for the tail of the binomial distribution,
+        which is exact for k = m.
+    """
+    n, hits = m - _FREE, k - _FREE
+    if n <= 0 or hits <= 0 or chance >= hits / n:
+        return math.inf
+    sets = (math.lgamma(m + 1) - math.lgamma(_FREE + 1) - math.lgamma(n + 1)) / math.log(10)
+    if chance <= 0.0:
+        return -math.inf
+    tail = hits * math.log10(hits / (n * chance))
+    if hits < n:
+        tail += (n - hits) * math.log10((n - hits) / (n * (1.0 - chance)))
+    return sets - tail
+
+
+def chance_agreement(table: Table, F: Array, q1: Array, q2: Array, limit: float) -> float:
+    """Return the probability that a wrong match is within a distance of an epipolar geometry.
+
+    Wrong matches are made of the points themselves: point i of one image with another point of the
+    other, so that crowded places count for what they are.
+
+    Parameters
+    ----------
+    table : Table
+        Backend.
+    F : ndarray, shape (3, 3)
+        Fundamental matrix.
+    q1, q2 : ndarray, shape (2, m)
+        All matches, right and wrong, contiguous.
+    limit : float
+        The distance.
+
+    Returns
+    -------
+    float
+        Where few wrong pairs are so near, from the density of the distance further out.
+    """
+    m = q1.shape[1]
+    rounds = min(-(-_PAIRS // m), m - 1)
+    shifts = np.unique(np.linspace(1, m - 1, rounds).astype(int))
+    distances = np.concatenate(
+        [
+            np.abs(
+                Reprojection(table, q1, np.ascontiguousarray(np.roll(q2, shift, axis=1)))
+                .evaluate(F)
+                .signed
+            )
+            for shift in shifts.tolist()
+        ]
+    )
+    near = int(np.count_nonzero(distances <= limit))
+    if near >= _WITHIN or near == len(distances):
+        return near / len(distances)
+    rank = min(_WITHIN, len(distances)) - 1
+    wide = float(np.partition(distances, rank)[rank])
+    return (rank + 1) / len(distances) * min(limit / wide, 1.0) if wide > 0.0 else 1.0
+
+
+def independent(q1: Array, q2: Array) -> int:
+    """Return how many of some matches are independent: each point of an image counts once.
+
+    Where many points are matched to one, every line through it agrees with all of them.
+    """
+    return min(len(np.unique(q, axis=1).T) for q in (q1, q2))
