@@ -86,7 +86,7 @@ def _near_a_sample(q1: Array, q2: Array, weights: Array) -> Array:
     four = np.argsort(rng.random((_SAMPLES, n)), axis=1)[:, :4]
     A = _equations(q1, q2)
     H = np.linalg.svd(A[four].reshape(_SAMPLES, 8, 9))[2][:, 8]
-    squares = np.array([_squares(h.reshape(3, 3), q1, q2, A) for h in H])
+    squares = _squares(H.reshape(-1, 3, 3), q1, q2, A)
     best = squares[np.argmin(np.median(squares, axis=1))]
     return np.asarray(weights / (1.0 + best / _median(best)) ** 2)
 
@@ -105,14 +105,17 @@ def _equations(q1: Array, q2: Array) -> Array:
 
 
 def _inverse(H: Array, q1: Array, q2: Array) -> Array:
-    """Return the inverse covariances (n, 2, 2) of the equations, for noise of variance one."""
-    J1 = np.einsum("in,j->nij", q2, H[2, :2]) - H[:2, :2]
-    depth = H[2, :2] @ q1 + H[2, 2]
-    squares = J1 @ J1.transpose(0, 2, 1) + depth[:, None, None] ** 2 * np.eye(2)
-    return np.asarray(np.linalg.inv(squares + np.finfo(float).tiny * np.eye(2)))
+    """Return the inverse covariances (..., n, 2, 2) of the equations, for noise of variance one."""
+    J1 = np.einsum("in,...j->...nij", q2, H[..., 2, :2]) - H[..., None, :2, :2]
+    depth = H[..., 2, :2] @ q1 + H[..., 2, 2:]
+    squares = J1 @ np.swapaxes(J1, -1, -2) + (depth**2)[..., None, None] * np.eye(2)
+    xx, xy, yy = squares[..., 0, 0], squares[..., 0, 1], squares[..., 1, 1]
+    inverse = np.stack([yy, -xy, -xy, xx], axis=-1).reshape(squares.shape)
+    # The determinant of a homography of lower rank may vanish
+    return np.asarray(inverse / np.maximum(xx * yy - xy * xy, 1e-200)[..., None, None])
 
 
 def _squares(H: Array, q1: Array, q2: Array, A: Array) -> Array:
-    """Return the squared distances to a homography, to first order."""
-    c = A @ H.ravel()
-    return np.asarray(np.einsum("ni,nij,nj->n", c, _inverse(H, q1, q2), c))
+    """Return the squared distances (..., n) to homographies, to first order."""
+    c = np.einsum("nia,...a->...ni", A, H.reshape(*H.shape[:-2], 9))
+    return np.asarray(np.einsum("...ni,...nij,...nj->...n", c, _inverse(H, q1, q2), c))
