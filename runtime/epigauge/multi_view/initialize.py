@@ -1,8 +1,6 @@
-"""A first reconstruction: two views, then the other cameras in turn; or all views at once."""
+"""A first reconstruction: by registering cameras in turn, or by factoring all views at once."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,89 +9,26 @@ from epigauge import lm
 from epigauge._arguments import as_choice, as_count
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table, table
-from epigauge.multi_view.agreement import agreed_camera, agreed_fundamental, agreed_points
 from epigauge.multi_view.dampings import Covariant
 from epigauge.multi_view.factorization import factorized
-from epigauge.multi_view.parallax import fit_homographies
+from epigauge.multi_view.frame import Frame
+from epigauge.multi_view.gauge import normalized
 from epigauge.multi_view.problem import BundleProblem
-from epigauge.multi_view.resection import resect
+from epigauge.multi_view.registration import registered
 from epigauge.multi_view.system import Layout
-from epigauge.multi_view.tracks import MIN_POINTS, MIN_VIEWS, Reconstruction, Tracks
-from epigauge.scatter import spread
-from epigauge.two_view.geometry import canonical_cameras
+from epigauge.multi_view.tracks import Reconstruction, Tracks
 from epigauge.two_view.losses import EFFICIENT, Loss, median, robust_scale
-from epigauge.two_view.refine import refine_fundamental
 
 __all__ = ["Frame", "initialize"]
 
 Array = NDArray[np.float64]
 
-Indices = NDArray[np.intp]
-
-#: Pairs of views, those with most common points, that are tried as a start, and the fewest points.
-_PAIRS, _MATCHES = 40, 8
-
 #: A registration has failed whose median residual is beyond this share of the RMS of the image
 #: coordinates.
 _FAILED = 0.05
 
-#: Robust registration adjusts what it has when the number of cameras has grown by this factor.
-_GROWTH = 1.25
-
-#: Points of a pair that its parallax is measured by, where that is robust.
-_FEW = 300
-
-#: Points whose views are counted at a time.
-_CHUNK = 4096
-
-
-@dataclass(frozen=True)
-class Frame:
-    """Image coordinates to compute in: each view's centroid, one scale for all.
-
-    Attributes
-    ----------
-    origins : ndarray, shape (n, 2)
-        Centroids of the views, in pixels.
-    scale : float
-        Pixels a unit; coordinates then have an RMS of one.
-    """
-
-    origins: Array
-    scale: float
-
-    @staticmethod
-    def of(tracks: Tracks) -> Frame:
-        """Choose the coordinates for some tracks, without observations of weight zero."""
-        tracks = _counted(tracks)
-        counts = np.bincount(tracks.view, minlength=tracks.n_views)
-        sums = [np.bincount(tracks.view, tracks.xy[:, k]) / counts for k in (0, 1)]
-        origins = np.stack(sums, axis=1)
-        centred = tracks.xy - origins[tracks.view]
-        scale = float(np.sqrt(np.mean(centred**2)))
-        if not scale > 0.0:
-            raise ArgumentError("tracks", "have all points of a view at one place", "other points")
-        return Frame(origins, scale)
-
-    def conditioned(self, tracks: Tracks) -> Array:
-        """Return the conditioned observations, shape (2, N)."""
-        return self.points_in(tracks.xy, tracks.view)
-
-    def points_in(self, xy: Array, view: Indices) -> Array:
-        """Return conditioned image points, shape (2, N), from pixels (N, 2)."""
-        return np.ascontiguousarray(((xy - self.origins[view]) / self.scale).T)
-
-    def cameras_in(self, P: Array) -> Array:
-        """Return cameras to conditioned coordinates from cameras to pixels."""
-        moved = P.copy()
-        moved[:, :2] = (P[:, :2] - self.origins[:, :, None] * P[:, 2:]) / self.scale
-        return moved
-
-    def cameras_out(self, P: Array) -> Array:
-        """Return cameras to pixels from cameras to conditioned coordinates."""
-        moved = P.copy()
-        moved[:, :2] = self.scale * P[:, :2] + self.origins[:, :, None] * P[:, 2:]
-        return moved
+#: Factorizations tried at most, trial steps of each, and how near costs of one minimum are.
+_TRIES, _TRIED, _SAME = 12, 40, 0.02
 
 
 def initialize(
@@ -113,18 +48,21 @@ def initialize(
         Observations.
     method : {"auto", "registration", "factorization"}
         "registration" begins with two views of strong geometry and registers the other cameras in
-        turn; robust against gross errors in some tracks by the Cauchy loss with a scale estimated
-        from the residuals. "factorization" needs no such views: it minimises a bilinear error over
-        all cameras at once, from random ones. "auto" registers, and where half the residuals are
-        beyond a twentieth of the RMS of the image coordinates, it factors robustly, too, and keeps
-        what has the lower median residual. Weights count when factoring; when registering,
-        observations of weight zero are left out where enough others remain.
+        turn. "factorization" needs no such views: it minimises a bilinear error over all cameras at
+        once, from random ones. "auto" registers; where that is refused (tracks too short to carry
+        a camera over), or half the residuals are beyond a twentieth of the RMS of the image
+        coordinates, it factors from several random starts, robustly and plainly, adjusts each a
+        little, and keeps the lowest once it has been reached twice. Weights count when factoring;
+        when registering, observations of weight zero are left out where enough others remain.
     incremental : bool
         When registering, adjust everything known, by a few robust steps, with each camera: slower,
         but errors do not add up over long sequences.
     robust : bool
-        When factoring, weigh down gross errors. Without them, the plain factorization leads to the
-        best minimum more often.
+        Against gross errors in the tracks, ten per cent or more. When registering: F, cameras and
+        points are those that most observations agree on, among many proposed by a few, and what
+        is known is adjusted as it grows. (Without, a Cauchy loss with an estimated scale bears
+        with few gross errors.) When factoring: weigh them down. Without them, the plain
+        factorization leads to the best minimum more often.
     seed : int
         When factoring, of the random cameras: another one is another chance.
     backend : {"c", "numpy", "casadi"}, optional
@@ -138,8 +76,8 @@ def initialize(
     Raises
     ------
     ArgumentError
-        When registering, if no two views have enough points in common, or a view shares fewer than
-        6 points with those before it.
+        With method "registration", if no two views have enough points in common, or a view shares
+        fewer than 6 points with those before it; with "auto", if factoring fails, too.
 
     References
     ----------
@@ -151,43 +89,26 @@ def initialize(
     kernels, frame = table(backend), Frame.of(tracks)
     if method == "factorization":
         return _factored(tracks, frame, kernels, robust, seed)
-    found = _registered(tracks, frame, kernels, incremental, robust)
-    residual = _median_residual(tracks, found)
-    if method == "registration" or residual <= _FAILED * frame.scale:
-        return found
-    other = _factored(tracks, frame, kernels, True, seed)
-    return other if _median_residual(tracks, other) < residual else found
-
-
-def _counted(tracks: Tracks) -> Tracks:
-    """Return the tracks without observations of weight zero; with them where too few are left."""
-    counts = tracks.weights > 0.0
-    if counts.all():
-        return tracks
-    view, point, xy, weights = (
-        array[counts] for array in (tracks.view, tracks.point, tracks.xy, tracks.weights)
-    )
+    found, refused = None, None
     try:
-        return Tracks(view, point, xy, tracks.n_views, tracks.n_points, weights)
+        found = registered(tracks, frame, kernels, incremental, robust)
+    except ArgumentError as error:
+        if method == "registration":
+            raise
+        refused = error
+    if found is not None:
+        residual = _median_residual(tracks, found)
+        if method == "registration" or residual <= _FAILED * frame.scale:
+            return found
+    try:
+        other = _best_factored(tracks, frame, kernels, seed)
     except ArgumentError:
-        return tracks
-
-
-def _registered(
-    tracks: Tracks, frame: Frame, kernels: Table, incremental: bool, robust: bool
-) -> Reconstruction:
-    tracks = _counted(tracks)
-    builder = _Builder(tracks, frame.conditioned(tracks), kernels, robust)
-    builder.begin(*_best_pair(tracks, frame, robust))
-    adjusted = 2
-    while not builder.registered.all():
-        builder.register(builder.next_view())
-        known = int(np.count_nonzero(builder.registered))
-        # Gross errors bend what hangs on a few cameras: these are adjusted as their number grows.
-        if incremental or (robust and (known >= _GROWTH * adjusted or known == tracks.n_views)):
-            builder.adjust()
-            adjusted = known
-    return Reconstruction(frame.cameras_out(builder.P), builder.Q)
+        raise refused or ArgumentError(
+            "tracks", "lead to no start", "longer tracks, or a start"
+        ) from None
+    if found is None:
+        return other
+    return other if _median_residual(tracks, other) < residual else found
 
 
 def _factored(
@@ -200,200 +121,37 @@ def _factored(
     return Reconstruction(frame.cameras_out(P), Q)
 
 
+def _best_factored(tracks: Tracks, frame: Frame, kernels: Table, seed: int) -> Reconstruction:
+    """Return the best of several factorizations, each adjusted a little.
+
+    A network of short tracks has many minima. The lowest of all that was tried is taken once two
+    starts have led to it; where it is found only once, after so many starts.
+    """
+    layout = Layout(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+    weights, q = np.asarray(tracks.weights), frame.conditioned(tracks)
+    problem = BundleProblem(kernels, layout, q, weights, Loss(), embedded=True)
+    stopping = lm.Stopping(ftol=1e-4, xtol=0.0, gtol=0.0, max_iter=_TRIED)
+    best, least = None, np.inf
+    for k in range(_TRIES):
+        start = factorized(kernels, layout, q, weights, seed=seed + k // 2, robust=k % 2 == 0)
+        if best is None:
+            scale = EFFICIENT["cauchy"] * robust_scale(problem.engine.distances(*start))
+            problem.loss = Loss("cauchy", max(float(np.nan_to_num(scale, posinf=1.0)), 1e-12))
+        try:
+            home = normalized().transformation(*start)
+            found = lm.minimize(problem, home.apply(*start), Covariant(), lm.Classic(), stopping)
+        except np.linalg.LinAlgError:
+            continue
+        again = abs(found.state.cost - least) <= _SAME * least
+        if best is None or found.state.cost < least:
+            best, least = (found.state.P, found.state.Q), found.state.cost
+        if again:
+            break
+    if best is None:
+        raise ArgumentError("tracks", "lead to no start", "longer tracks, or a start")
+    return Reconstruction(frame.cameras_out(best[0]), best[1])
+
+
 def _median_residual(tracks: Tracks, found: Reconstruction) -> float:
     distances = np.linalg.norm(tracks.xy - found.project(tracks), axis=1)
     return median(np.nan_to_num(distances[tracks.weights > 0.0], nan=np.inf))
-
-
-def _best_pair(tracks: Tracks, frame: Frame, robust: bool) -> tuple[int, int]:
-    """Choose the pair with the most points that no homography explains."""
-    common = _common_points(tracks)
-    pairs = np.argsort(-common, axis=None, kind="stable")[:_PAIRS]
-    pairs = pairs[common.ravel()[pairs] >= _MATCHES]
-    if not len(pairs):
-        what = f"have no two views with {_MATCHES} common points"
-        raise ArgumentError("tracks", what, "longer tracks, or method='factorization'")
-    chosen = np.stack(np.unravel_index(pairs, common.shape), axis=1)
-    rows = {view: _rows(tracks, view) for view in np.unique(chosen)}
-    both = [np.flatnonzero((rows[i] >= 0) & (rows[k] >= 0)) for i, k in chosen]
-    sizes = np.array([len(points) for points in both])
-    if robust:
-        both = [points[:: -(-len(points) // _FEW)] for points in both]
-    first = np.concatenate([[0], np.cumsum([len(points) for points in both])])
-    q = frame.conditioned(tracks).T
-    sides = (zip(side, both, strict=True) for side in chosen.T)
-    x1, x2 = (np.concatenate([q[rows[view][points]] for view, points in side]) for side in sides)
-    if robust:
-        errors = fit_homographies(x1, x2, first).distances
-        parallax = np.array([median(part) for part in np.split(errors, first[1:-1])])
-    else:
-        parallax = _homography_residuals(x1, x2, first)
-    i, k = chosen[np.argmax(sizes * parallax)]
-    return int(i), int(k)
-
-
-def _common_points(tracks: Tracks) -> Array:
-    """Return the number of points that each pair of views has in common, above the diagonal."""
-    common = np.zeros((tracks.n_views, tracks.n_views), dtype=np.float32)
-    for begin in range(0, tracks.n_points, _CHUNK):
-        some = slice(*np.searchsorted(tracks.point, [begin, begin + _CHUNK]))
-        incidence = np.zeros((min(_CHUNK, tracks.n_points), tracks.n_views), dtype=np.float32)
-        incidence[tracks.point[some] - begin, tracks.view[some]] = 1.0
-        common += incidence.T @ incidence
-    return np.triu(common, 1)
-
-
-def _rows(tracks: Tracks, view: int) -> Indices:
-    """Return the observation of each point in a view, -1 where there is none."""
-    own = np.flatnonzero(tracks.view == view)
-    rows = np.full(tracks.n_points, -1)
-    rows[tracks.point[own]] = own
-    return rows
-
-
-def _homography_residuals(x1: Array, x2: Array, first: Indices) -> Array:
-    """Return the median transfer error of the homography fitted to each group of matches (DLT).
-
-    Parameters
-    ----------
-    x1, x2 : ndarray, shape (m, 2)
-        Matches of all groups.
-    first : ndarray of int, shape (k + 1,)
-        First match of each group, and m.
-    """
-    a = np.column_stack([x1, np.ones(len(x1))])
-    # Normal equations of rows (a, 0, -b_1 a) and (0, a, -b_2 a), block by block.
-    b1, b2 = x2.T
-    square = a[:, :, None] * a[:, None, :]
-    weights = np.stack([np.ones(len(a)), b1, b2, b1**2 + b2**2], axis=1)
-    sums = np.add.reduceat(weights[:, :, None, None] * square[:, None], first[:-1])
-    plain, across1, across2, both = np.moveaxis(sums, 1, 0)
-    N = np.zeros((len(first) - 1, 9, 9))
-    N[:, :3, :3] = N[:, 3:6, 3:6] = plain
-    N[:, :3, 6:] = N[:, 6:, :3] = -across1
-    N[:, 3:6, 6:] = N[:, 6:, 3:6] = -across2
-    N[:, 6:, 6:] = both
-    H = np.linalg.eigh(N)[1][:, :, 0].reshape(-1, 3, 3)
-    h = np.einsum("mij,mj->mi", np.repeat(H, np.diff(first), axis=0), a)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        error = np.linalg.norm(h[:, :2] / h[:, 2:] - x2, axis=1)
-    error = np.nan_to_num(error, nan=0.0, posinf=0.0)
-    return np.array([median(part) for part in np.split(error, first[1:-1])])
-
-
-class _Builder:
-    """Cameras and points known so far."""
-
-    def __init__(self, tracks: Tracks, q: Array, kernels: Table, robust: bool) -> None:
-        self.tracks, self.q, self.kernels, self.robust = tracks, q, kernels, robust
-        self.P = np.zeros((tracks.n_views, 3, 4))
-        self.Q = np.zeros((tracks.n_points, 4))
-        self.registered = np.zeros(tracks.n_views, dtype=np.bool_)
-        self.known = np.zeros(tracks.n_points, dtype=np.bool_)
-
-    def begin(self, i: int, k: int) -> None:
-        """Start with two views."""
-        rows = _rows(self.tracks, i), _rows(self.tracks, k)
-        points = np.flatnonzero((rows[0] >= 0) & (rows[1] >= 0))
-        x1, x2 = (self.q[:, own[points]].T for own in rows)
-        backend = self.kernels.name
-        try:
-            F, agrees = None, np.ones(len(points), dtype=np.bool_)
-            if self.robust:
-                F, agrees = agreed_fundamental(self.kernels, x1, x2)
-                points = points[agrees]
-            result = refine_fundamental(
-                x1[agrees], x2[agrees], F, loss="cauchy", max_iter=200, backend=backend
-            )
-        except ArgumentError as error:
-            raise ArgumentError(
-                "tracks",
-                f"have common points in views {i} and {k}, the best two, that do not determine F "
-                f"({error.argument} {error.was})",
-                "points spread over two dimensions in both",
-            ) from None
-        self.P[i], self.P[k] = canonical_cameras(result.F)
-        self.Q[points] = result.points
-        self.registered[[i, k]] = True
-        self.known[points] = True
-        self._spread()
-
-    def next_view(self) -> int:
-        """Return the view outside that sees the most known points."""
-        seen = self.known[self.tracks.point] & ~self.registered[self.tracks.view]
-        counts = np.bincount(self.tracks.view[seen], minlength=self.tracks.n_views)
-        view = int(np.argmax(counts))
-        if counts[view] < MIN_POINTS:
-            outside = np.flatnonzero(~self.registered)[:5].tolist()
-            raise ArgumentError(
-                "tracks",
-                f"leave views {outside} with fewer than {MIN_POINTS} points in common with the "
-                "others",
-                "longer or more tracks, fewer views, or method='factorization'",
-            )
-        return view
-
-    def register(self, view: int) -> None:
-        """Find the camera of a view from known points, then the points it completes."""
-        rows = np.flatnonzero((self.tracks.view == view) & self.known[self.tracks.point])
-        q, Q = self.q[:, rows], self.Q[self.tracks.point[rows]].T
-        start = agreed_camera(q, Q) if self.robust else None
-        self.P[view] = resect(self.kernels, q, Q, start)
-        self.registered[view] = True
-        # Points that it does not see are left as they are, but for a last round with all views.
-        self._triangulate(None if self.registered.all() else view)
-        self._spread()
-
-    def adjust(self) -> None:
-        """Adjust all registered cameras and known points by a few robust covariant steps."""
-        rows = np.flatnonzero(self.registered[self.tracks.view] & self.known[self.tracks.point])
-        views, local_views = np.unique(self.tracks.view[rows], return_inverse=True)
-        points, local_points = np.unique(self.tracks.point[rows], return_inverse=True)
-        layout = Layout(local_views, local_points, len(views), len(points))
-        q = np.ascontiguousarray(self.q[:, rows])
-        problem = BundleProblem(self.kernels, layout, q, np.ones(len(rows)), Loss(), embedded=True)
-        estimate = self.P[views], self.Q[points]
-        scale = EFFICIENT["cauchy"] * robust_scale(problem.engine.distances(*estimate))
-        problem.loss = Loss("cauchy", max(scale, 1e-12))
-        stopping = lm.Stopping(ftol=1e-3, xtol=0.0, gtol=0.0, max_iter=5)
-        found = lm.minimize(problem, estimate, Covariant(), lm.Classic(), stopping)
-        self.P[views], self.Q[points] = found.state.P, found.state.Q
-        self._spread()
-
-    def _triangulate(self, view: int | None) -> None:
-        """Triangulate the points of a view, or all, that two or more registered views see."""
-        tracks = self.tracks
-        rows = np.flatnonzero(self.registered[tracks.view])
-        if view is not None:
-            seen = np.zeros(tracks.n_points, dtype=np.bool_)
-            seen[tracks.point[tracks.view == view]] = True
-            rows = rows[seen[tracks.point[rows]]]
-        counts = np.bincount(tracks.point[rows], minlength=tracks.n_points)
-        rows = rows[counts[tracks.point[rows]] >= MIN_VIEWS]
-        points, local = np.unique(tracks.point[rows], return_inverse=True)
-        layout = Layout(tracks.view[rows], local, tracks.n_views, len(points))
-        q = np.ascontiguousarray(self.q[:, rows])
-        problem = BundleProblem(self.kernels, layout, q, np.ones(len(rows)), Loss())
-        self.Q[points] = _triangulated(self.P, self.Q[points], self.known[points], problem)
-        if self.robust:
-            self.Q[points] = agreed_points(problem, self.P, self.Q[points], problem.loss.scale)
-        self.known[points] = True
-
-    def _spread(self) -> None:
-        """Move to the basis in which the known points are spread evenly, scales of norm one."""
-        self.Q[self.known], T = spread(self.Q[self.known])
-        P = self.P[self.registered] @ T
-        self.P[self.registered] = P / np.linalg.norm(P, axis=(1, 2), keepdims=True)
-
-
-def _triangulated(P: Array, Q: Array, known: NDArray[np.bool_], problem: BundleProblem) -> Array:
-    """Return points triangulated linearly where new, then refined, with a robust loss."""
-    linear = problem.engine.intersected(P)
-    Q = np.where(known[:, None], Q, linear)
-    distances = problem.engine.distances(P, linear)
-    scale = EFFICIENT["cauchy"] * robust_scale(np.nan_to_num(distances, posinf=1e3))
-    problem.loss = Loss("cauchy", max(scale, 1e-12))
-    # A known point may have been led astray by the new view's error: keep the better start.
-    costs = [np.nan_to_num(problem.point_costs(P, start), nan=np.inf) for start in (Q, linear)]
-    Q = np.where((costs[0] <= costs[1])[:, None], Q, linear)
-    return problem.triangulated(P, Q)

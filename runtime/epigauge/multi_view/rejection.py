@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from epigauge.kernels import Table
 from epigauge.multi_view.agreement import agreed_points
+from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import normalized
-from epigauge.multi_view.initialize import Frame
 from epigauge.multi_view.problem import BundleProblem
 from epigauge.multi_view.system import Layout
 from epigauge.multi_view.tracks import MIN_VIEWS, Reconstruction, Tracks

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from epigauge.kernels import Table
 from epigauge.multi_view.coupling import Reduced, solved
 from epigauge.multi_view.dampings import Covariant
+from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import normalized
-from epigauge.multi_view.initialize import Frame
 from epigauge.multi_view.parallax import parallax_flags
 from epigauge.multi_view.problem import BundleProblem, BundleState
 from epigauge.multi_view.seen import Seen

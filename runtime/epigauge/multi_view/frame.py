@@ -1,0 +1,79 @@
+"""Image coordinates that the many-view part computes in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.errors import ArgumentError
+from epigauge.multi_view.tracks import Tracks
+
+__all__ = ["Frame", "counted"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Image coordinates to compute in: each view's centroid, one scale for all.
+
+    Attributes
+    ----------
+    origins : ndarray, shape (n, 2)
+        Centroids of the views, in pixels.
+    scale : float
+        Pixels a unit; coordinates then have an RMS of one.
+    """
+
+    origins: Array
+    scale: float
+
+    @staticmethod
+    def of(tracks: Tracks) -> Frame:
+        """Choose the coordinates for some tracks, without observations of weight zero."""
+        tracks = counted(tracks)
+        counts = np.bincount(tracks.view, minlength=tracks.n_views)
+        sums = [np.bincount(tracks.view, tracks.xy[:, k]) / counts for k in (0, 1)]
+        origins = np.stack(sums, axis=1)
+        centred = tracks.xy - origins[tracks.view]
+        scale = float(np.sqrt(np.mean(centred**2)))
+        if not scale > 0.0:
+            raise ArgumentError("tracks", "have all points of a view at one place", "other points")
+        return Frame(origins, scale)
+
+    def conditioned(self, tracks: Tracks) -> Array:
+        """Return the conditioned observations, shape (2, N)."""
+        return self.points_in(tracks.xy, tracks.view)
+
+    def points_in(self, xy: Array, view: Indices) -> Array:
+        """Return conditioned image points, shape (2, N), from pixels (N, 2)."""
+        return np.ascontiguousarray(((xy - self.origins[view]) / self.scale).T)
+
+    def cameras_in(self, P: Array) -> Array:
+        """Return cameras to conditioned coordinates from cameras to pixels."""
+        moved = P.copy()
+        moved[:, :2] = (P[:, :2] - self.origins[:, :, None] * P[:, 2:]) / self.scale
+        return moved
+
+    def cameras_out(self, P: Array) -> Array:
+        """Return cameras to pixels from cameras to conditioned coordinates."""
+        moved = P.copy()
+        moved[:, :2] = self.scale * P[:, :2] + self.origins[:, :, None] * P[:, 2:]
+        return moved
+
+
+def counted(tracks: Tracks) -> Tracks:
+    """Return the tracks without observations of weight zero; with them where too few are left."""
+    counts = tracks.weights > 0.0
+    if counts.all():
+        return tracks
+    view, point, xy, weights = (
+        array[counts] for array in (tracks.view, tracks.point, tracks.xy, tracks.weights)
+    )
+    try:
+        return Tracks(view, point, xy, tracks.n_views, tracks.n_points, weights)
+    except ArgumentError:
+        return tracks

@@ -1,0 +1,329 @@
+"""A first reconstruction by registration: two views, then the other cameras in turn."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge import lm
+from epigauge.errors import ArgumentError
+from epigauge.kernels import Table
+from epigauge.multi_view.agreement import agreed_camera, agreed_fundamental, agreed_points
+from epigauge.multi_view.dampings import Covariant
+from epigauge.multi_view.frame import Frame, counted
+from epigauge.multi_view.parallax import fit_homographies
+from epigauge.multi_view.problem import BundleProblem
+from epigauge.multi_view.resection import resect
+from epigauge.multi_view.system import Layout
+from epigauge.multi_view.tracks import MIN_POINTS, MIN_VIEWS, Reconstruction, Tracks
+from epigauge.scatter import spread
+from epigauge.two_view.geometry import canonical_cameras
+from epigauge.two_view.losses import EFFICIENT, Loss, median, robust_scale
+from epigauge.two_view.refine import refine_fundamental
+
+__all__ = ["registered"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: Pairs of views, those with most common points, that are tried as a start, and the fewest points.
+_PAIRS, _MATCHES = 40, 8
+
+#: Robust registration adjusts what it has when the number of cameras has grown by this factor.
+_GROWTH = 1.25
+
+#: Points of a pair that its parallax is measured by, where that is robust.
+_FEW = 300
+
+#: Known views whose matches a camera without known points is found from, at most.
+_PARTNERS = 10
+
+#: Points whose views are counted at a time.
+_CHUNK = 4096
+
+
+def registered(
+    tracks: Tracks, frame: Frame, kernels: Table, incremental: bool, robust: bool
+) -> Reconstruction:
+    """Reconstruct from two views and the others in turn.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Observations.
+    frame : Frame
+        Image coordinates to compute in.
+    kernels : Table
+        Backend.
+    incremental : bool
+        Adjust everything known with each camera.
+    robust : bool
+        Take what most observations agree on, and adjust as the number of cameras grows.
+
+    Returns
+    -------
+    Reconstruction
+        All cameras and points.
+
+    Raises
+    ------
+    ArgumentError
+        If no two views have enough points in common, or a view too few with those before it.
+    """
+    tracks = counted(tracks)
+    builder = _Builder(tracks, frame.conditioned(tracks), kernels, robust)
+    builder.begin(*_best_pair(tracks, frame, robust))
+    adjusted = 2
+    while not builder.registered.all():
+        builder.register(builder.next_view())
+        known = int(np.count_nonzero(builder.registered))
+        # Gross errors bend what hangs on a few cameras: these are adjusted as their number grows.
+        if incremental or (robust and (known >= _GROWTH * adjusted or known == tracks.n_views)):
+            builder.adjust()
+            adjusted = known
+    return Reconstruction(frame.cameras_out(builder.P), builder.Q)
+
+
+def _best_pair(tracks: Tracks, frame: Frame, robust: bool) -> tuple[int, int]:
+    """Choose the pair with the most points that no homography explains."""
+    common = _common_points(tracks)
+    pairs = np.argsort(-common, axis=None, kind="stable")[:_PAIRS]
+    pairs = pairs[common.ravel()[pairs] >= _MATCHES]
+    if not len(pairs):
+        what = f"have no two views with {_MATCHES} common points"
+        raise ArgumentError("tracks", what, "longer tracks, or method='factorization'")
+    chosen = np.stack(np.unravel_index(pairs, common.shape), axis=1)
+    rows = {view: _rows(tracks, view) for view in np.unique(chosen)}
+    both = [np.flatnonzero((rows[i] >= 0) & (rows[k] >= 0)) for i, k in chosen]
+    sizes = np.array([len(points) for points in both])
+    if robust:
+        both = [points[:: -(-len(points) // _FEW)] for points in both]
+    first = np.concatenate([[0], np.cumsum([len(points) for points in both])])
+    q = frame.conditioned(tracks).T
+    sides = (zip(side, both, strict=True) for side in chosen.T)
+    x1, x2 = (np.concatenate([q[rows[view][points]] for view, points in side]) for side in sides)
+    if robust:
+        errors = fit_homographies(x1, x2, first).distances
+        parallax = np.array([median(part) for part in np.split(errors, first[1:-1])])
+    else:
+        parallax = _homography_residuals(x1, x2, first)
+    i, k = chosen[np.argmax(sizes * parallax)]
+    return int(i), int(k)
+
+
+def _common_points(tracks: Tracks) -> Array:
+    """Return the number of points that each pair of views has in common, above the diagonal."""
+    common = np.zeros((tracks.n_views, tracks.n_views), dtype=np.float32)
+    for begin in range(0, tracks.n_points, _CHUNK):
+        some = slice(*np.searchsorted(tracks.point, [begin, begin + _CHUNK]))
+        incidence = np.zeros((min(_CHUNK, tracks.n_points), tracks.n_views), dtype=np.float32)
+        incidence[tracks.point[some] - begin, tracks.view[some]] = 1.0
+        common += incidence.T @ incidence
+    return np.triu(common, 1)
+
+
+def _rows(tracks: Tracks, view: int) -> Indices:
+    """Return the observation of each point in a view, -1 where there is none."""
+    own = np.flatnonzero(tracks.view == view)
+    rows = np.full(tracks.n_points, -1)
+    rows[tracks.point[own]] = own
+    return rows
+
+
+def _homography_residuals(x1: Array, x2: Array, first: Indices) -> Array:
+    """Return the median transfer error of the homography fitted to each group of matches (DLT).
+
+    Parameters
+    ----------
+    x1, x2 : ndarray, shape (m, 2)
+        Matches of all groups.
+    first : ndarray of int, shape (k + 1,)
+        First match of each group, and m.
+    """
+    a = np.column_stack([x1, np.ones(len(x1))])
+    # Normal equations of rows (a, 0, -b_1 a) and (0, a, -b_2 a), block by block.
+    b1, b2 = x2.T
+    square = a[:, :, None] * a[:, None, :]
+    weights = np.stack([np.ones(len(a)), b1, b2, b1**2 + b2**2], axis=1)
+    sums = np.add.reduceat(weights[:, :, None, None] * square[:, None], first[:-1])
+    plain, across1, across2, both = np.moveaxis(sums, 1, 0)
+    N = np.zeros((len(first) - 1, 9, 9))
+    N[:, :3, :3] = N[:, 3:6, 3:6] = plain
+    N[:, :3, 6:] = N[:, 6:, :3] = -across1
+    N[:, 3:6, 6:] = N[:, 6:, 3:6] = -across2
+    N[:, 6:, 6:] = both
+    H = np.linalg.eigh(N)[1][:, :, 0].reshape(-1, 3, 3)
+    h = np.einsum("mij,mj->mi", np.repeat(H, np.diff(first), axis=0), a)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        error = np.linalg.norm(h[:, :2] / h[:, 2:] - x2, axis=1)
+    error = np.nan_to_num(error, nan=0.0, posinf=0.0)
+    return np.array([median(part) for part in np.split(error, first[1:-1])])
+
+
+class _Builder:
+    """Cameras and points known so far."""
+
+    def __init__(self, tracks: Tracks, q: Array, kernels: Table, robust: bool) -> None:
+        self.tracks, self.q, self.kernels, self.robust = tracks, q, kernels, robust
+        self.P = np.zeros((tracks.n_views, 3, 4))
+        self.Q = np.zeros((tracks.n_points, 4))
+        self.registered = np.zeros(tracks.n_views, dtype=np.bool_)
+        self.known = np.zeros(tracks.n_points, dtype=np.bool_)
+
+    def begin(self, i: int, k: int) -> None:
+        """Start with two views."""
+        rows = _rows(self.tracks, i), _rows(self.tracks, k)
+        F, Q, points = self._pair(i, k, np.flatnonzero((rows[0] >= 0) & (rows[1] >= 0)))
+        self.P[i], self.P[k] = canonical_cameras(F)
+        self.Q[points] = Q
+        self.registered[[i, k]] = True
+        self.known[points] = True
+        self._spread()
+
+    def next_view(self) -> int:
+        """Return the view outside that sees the most known points.
+
+        Where none sees enough, the one with matches in most known views, at least two.
+        """
+        tracks = self.tracks
+        seen = self.known[tracks.point] & ~self.registered[tracks.view]
+        counts = np.bincount(tracks.view[seen], minlength=tracks.n_views)
+        view = int(np.argmax(counts))
+        if counts[view] >= MIN_POINTS:
+            return view
+        pairs = (self.common >= _MATCHES) & self.registered
+        pairs[self.registered] = False
+        view = int(np.argmax(np.where(pairs, self.common, 0.0).sum(axis=1) * pairs.sum(axis=1)))
+        if np.count_nonzero(pairs[view]) < 2:
+            outside = np.flatnonzero(~self.registered)[:5].tolist()
+            raise ArgumentError(
+                "tracks",
+                f"leave views {outside} with fewer than {MIN_POINTS} points in common with the "
+                f"others, and with {_MATCHES} matches in fewer than two of them",
+                "longer or more tracks, fewer views, or method='factorization'",
+            )
+        return view
+
+    @cached_property
+    def common(self) -> Array:
+        """Return the number of points that two views have in common, (n, n)."""
+        above = _common_points(self.tracks)
+        return np.asarray(above + above.T)
+
+    def register(self, view: int) -> None:
+        """Find the camera of a view from known points, then the points it completes."""
+        rows = np.flatnonzero((self.tracks.view == view) & self.known[self.tracks.point])
+        by_points = len(rows) >= MIN_POINTS
+        if by_points:
+            q, Q = self.q[:, rows], self.Q[self.tracks.point[rows]].T
+            start = agreed_camera(q, Q) if self.robust else None
+            self.P[view] = resect(self.kernels, q, Q, start)
+        else:
+            self.P[view] = self._from_pairs(view)
+        self.registered[view] = True
+        # Points that it does not see are left as they are, but for a last round with all views.
+        self._triangulate(None if self.registered.all() else view)
+        self._spread()
+        if not by_points:
+            self.adjust()
+
+    def _from_pairs(self, view: int) -> Array:
+        """Return the camera that fits the fundamental matrices with known views.
+
+        P_k^T F P_i is skew-symmetric for all of them: linear in P_k.
+        """
+        others = np.flatnonzero(self.registered & (self.common[view] >= _MATCHES))
+        others = others[np.argsort(-self.common[view, others], kind="stable")][:_PARTNERS]
+        equations = []
+        own = _rows(self.tracks, view)
+        for i in others.tolist():
+            rows = _rows(self.tracks, i)
+            points = np.flatnonzero((rows >= 0) & (own >= 0))
+            F, _, _ = self._pair(i, view, points)
+            G = F @ self.P[i]
+            # Entry (j, l) of G^T P + P^T G, as a linear map of P (3, 4).
+            half = np.einsum("aj,lm->jlam", G, np.eye(4))
+            both = (half + half.swapaxes(0, 1))[np.triu_indices(4)]
+            equations.append(float(np.sqrt(len(points))) * both.reshape(10, 12))
+        P = np.linalg.svd(np.concatenate(equations))[2][-1].reshape(3, 4)
+        return np.asarray(P)
+
+    def _pair(self, i: int, k: int, points: Indices) -> tuple[Array, Array, Indices]:
+        """Return F from view i to view k, and the points that agree with it."""
+        x1, x2 = (self.q[:, _rows(self.tracks, view)[points]].T for view in (i, k))
+        try:
+            F, agrees = None, np.ones(len(points), dtype=np.bool_)
+            if self.robust:
+                F, agrees = agreed_fundamental(self.kernels, x1, x2)
+            result = refine_fundamental(
+                x1[agrees],
+                x2[agrees],
+                F,
+                loss="cauchy",
+                max_iter=200,
+                backend=self.kernels.name,
+            )
+        except ArgumentError as error:
+            raise ArgumentError(
+                "tracks",
+                f"have common points in views {i} and {k} that do not determine F "
+                f"({error.argument} {error.was})",
+                "points spread over two dimensions in both",
+            ) from None
+        return result.F, result.points, points[agrees]
+
+    def adjust(self) -> None:
+        """Adjust all registered cameras and known points by a few robust covariant steps."""
+        rows = np.flatnonzero(self.registered[self.tracks.view] & self.known[self.tracks.point])
+        views, local_views = np.unique(self.tracks.view[rows], return_inverse=True)
+        points, local_points = np.unique(self.tracks.point[rows], return_inverse=True)
+        layout = Layout(local_views, local_points, len(views), len(points))
+        q = np.ascontiguousarray(self.q[:, rows])
+        problem = BundleProblem(self.kernels, layout, q, np.ones(len(rows)), Loss(), embedded=True)
+        estimate = self.P[views], self.Q[points]
+        scale = EFFICIENT["cauchy"] * robust_scale(problem.engine.distances(*estimate))
+        problem.loss = Loss("cauchy", max(scale, 1e-12))
+        stopping = lm.Stopping(ftol=1e-3, xtol=0.0, gtol=0.0, max_iter=5)
+        found = lm.minimize(problem, estimate, Covariant(), lm.Classic(), stopping)
+        self.P[views], self.Q[points] = found.state.P, found.state.Q
+        self._spread()
+
+    def _triangulate(self, view: int | None) -> None:
+        """Triangulate the points of a view, or all, that two or more registered views see."""
+        tracks = self.tracks
+        rows = np.flatnonzero(self.registered[tracks.view])
+        if view is not None:
+            seen = np.zeros(tracks.n_points, dtype=np.bool_)
+            seen[tracks.point[tracks.view == view]] = True
+            rows = rows[seen[tracks.point[rows]]]
+        counts = np.bincount(tracks.point[rows], minlength=tracks.n_points)
+        rows = rows[counts[tracks.point[rows]] >= MIN_VIEWS]
+        points, local = np.unique(tracks.point[rows], return_inverse=True)
+        layout = Layout(tracks.view[rows], local, tracks.n_views, len(points))
+        q = np.ascontiguousarray(self.q[:, rows])
+        problem = BundleProblem(self.kernels, layout, q, np.ones(len(rows)), Loss())
+        self.Q[points] = _triangulated(self.P, self.Q[points], self.known[points], problem)
+        if self.robust:
+            self.Q[points] = agreed_points(problem, self.P, self.Q[points], problem.loss.scale)
+        self.known[points] = True
+
+    def _spread(self) -> None:
+        """Move to the basis in which the known points are spread evenly, scales of norm one."""
+        self.Q[self.known], T = spread(self.Q[self.known])
+        P = self.P[self.registered] @ T
+        self.P[self.registered] = P / np.linalg.norm(P, axis=(1, 2), keepdims=True)
+
+
+def _triangulated(P: Array, Q: Array, known: NDArray[np.bool_], problem: BundleProblem) -> Array:
+    """Return points triangulated linearly where new, then refined, with a robust loss."""
+    linear = problem.engine.intersected(P)
+    Q = np.where(known[:, None], Q, linear)
+    distances = problem.engine.distances(P, linear)
+    scale = EFFICIENT["cauchy"] * robust_scale(np.nan_to_num(distances, posinf=1e3))
+    problem.loss = Loss("cauchy", max(scale, 1e-12))
+    # A known point may have been led astray by the new view's error: keep the better start.
+    costs = [np.nan_to_num(problem.point_costs(P, start), nan=np.inf) for start in (Q, linear)]
+    Q = np.where((costs[0] <= costs[1])[:, None], Q, linear)
+    return problem.triangulated(P, Q)
