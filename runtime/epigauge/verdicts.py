@@ -82,8 +82,9 @@ FLAGS = {
         "a few matches carry most of the error: wrong ones among them, which least squares bends "
         "the result to",
         "find the right matches with estimate_fundamental (`epigauge estimate`), or mark them "
-        "(`--inliers`)",
-        ("F", "E"),
+        "(`--inliers`); in tracks, set the wrong ones aside with robust=True (`epigauge bundle "
+        "--robust`)",
+        ("F", "E", "views"),
     ),
     "behind the cameras": Flag(
         "some points lie behind a camera",

@@ -208,6 +208,9 @@ def bundle_adjust(
     accepted by the robust one. The result never costs more than the start. From random cameras
     this is not enough: begin with ``initialize(tracks, method="factorization")``.
 
+    From a start so degenerate that no step can be made (all points in one plane, a point in a focal
+    plane, all cameras at one place), the adjustment begins once more, a thousandth away.
+
     References
     ----------
     .. [B03] A. Bartoli, "Towards gauge invariant bundle adjustment", ICCV 2003.
@@ -310,39 +313,37 @@ def bundle_adjust(
         embedded and strategy.embedded and damping in (None, "covariant"),
         workers,
     )
-    P, Q = frame.cameras_in(start.P), start.Q
     explicit = strategy.gauge if strategy.explicit else gauge
     if gauge is not None and gauge_mode == "implicit":
         act, explicit = dampings.Implicit(act, gauge), None
     # The best conditioned basis, where the method does not mind and the caller does not ask.
     home = normalized() if isinstance(act, dampings.Covariant) and gauge is None else identity()
     first = strategy.gauge or explicit or home
-    there = first.transformation(P, Q)
-    problem = _problem(strategy, explicit, parts, Q)
-    # Points jump alike whatever the caller's basis, but only in the one chosen here: in no gauge.
-    minimize = far.minimize if problem.embedded and gauge is None else lm.minimize
+
+    def minimized(P: Array, Q: Array) -> tuple[lm.Outcome[Any], Array, Array]:
+        there = first.transformation(P, Q)
+        problem = _problem(strategy, explicit, parts, Q)
+        # Points jump alike whatever the basis, but only in the one chosen here: in no gauge.
+        minimize = far.minimize if problem.embedded and gauge is None else lm.minimize
+        begun, how = there.apply(P, Q), _SCHEDULES[schedule]()
+        unit = frame.scale**2
+        outcome = minimize(problem, begun, act, how, stopping, callback, unit)
+        P, Q = outcome.state.P, outcome.state.Q
+        return (outcome, *(there.inverse().apply(P, Q) if first is home else (P, Q)))
+
     try:
-        outcome: lm.Outcome[Any] = minimize(
-            problem,
-            there.apply(P, Q),
-            act,
-            _SCHEDULES[schedule](),
-            stopping,
-            callback,
-            frame.scale**2,
-        )
+        outcome, P, Q = far.minimized_from(minimized, frame.cameras_in(start.P), start.Q)
     except np.linalg.LinAlgError:
         raise ArgumentError(
             "start",
-            f"leaves the steps of method={method!r} undetermined (singular normal equations)",
-            "cameras with different centres, points away from them, or method='levenberg'",
+            f"leaves the steps of method={method!r} undetermined (singular normal equations), and "
+            "so does one a thousandth away",
+            "cameras with different centres, points away from them and not in one plane, or "
+            "method='covariant'",
         ) from None
-    P, Q = outcome.state.P, outcome.state.Q
-    if first is home:
-        P, Q = there.inverse().apply(P, Q)
     reconstruction = Reconstruction(frame.cameras_out(P), Q)
     rejected = np.zeros(len(tracks), dtype=np.bool_)
-    verdict = judged(tracks, reconstruction, rejected, table, workers)
+    verdict = judged(tracks, reconstruction, rejected, loss == "linear", table, workers)
     return _result(
         tracks, reconstruction, outcome, frame.scale**2, verdict, rejected, method, scale_px
     )

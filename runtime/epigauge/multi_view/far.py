@@ -1,4 +1,4 @@
-"""Starts far from any minimum, where points lie on the wrong side of infinity."""
+"""Starts far from any minimum, with points on the wrong side of infinity, and degenerate ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from epigauge import lm
 from epigauge.multi_view.problem import BundleProblem, BundleState
 from epigauge.two_view.losses import Loss, median
 
-__all__ = ["FAR", "JumpingProblem", "minimize"]
+__all__ = ["FAR", "JumpingProblem", "minimize", "minimized_from"]
 
 Array = NDArray[np.float64]
 
@@ -26,6 +26,10 @@ _SCALE = 0.05
 
 #: When the steps that bring it nearer end: relative decrease of their cost, and trial steps.
 _FTOL, _STEPS = 1e-3, 15
+
+
+#: Relative size of the change that makes a degenerate start regular.
+_NUDGE = 1e-3
 
 
 class JumpingProblem(BundleProblem):
@@ -135,3 +139,53 @@ def minimize(
         nit=first.nit + second.nit,
         history=tuple(history),
     )
+
+
+def minimized_from(
+    minimized: Callable[[Array, Array], tuple[lm.Outcome[BundleState], Array, Array]],
+    P: Array,
+    Q: Array,
+) -> tuple[lm.Outcome[BundleState], Array, Array]:
+    """Minimise from a start or, where no step can be made from it, from one a thousandth away.
+
+    Parameters
+    ----------
+    minimized : callable
+        Returns outcome, cameras and points; the steps may turn out singular.
+    P, Q : ndarray, shape (n, 3, 4), (m, 4)
+        The start.
+
+    Returns
+    -------
+    outcome, P, Q
+        Of the better of both.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If both are singular.
+    """
+    found = None
+    try:
+        # A start with a point in a focal plane has no finite blocks: its cost tells.
+        with np.errstate(invalid="ignore", over="ignore"):
+            found = minimized(P, Q)
+        stuck = not any(row.accepted for row in found[0].history[1:])
+        if not (stuck and found[0].status in (-3, -1)):
+            return found
+    except np.linalg.LinAlgError:
+        pass
+    rng = np.random.default_rng(0)
+    sizes = np.linalg.norm(P, axis=(1, 2), keepdims=True), np.linalg.norm(Q, axis=1, keepdims=True)
+    nudged = (
+        part + _NUDGE * size * rng.normal(size=part.shape)
+        for part, size in zip((P, Q), sizes, strict=True)
+    )
+    try:
+        again = minimized(*nudged)
+    except np.linalg.LinAlgError:
+        if found is None:
+            raise
+        return found
+    better = found is None or again[0].state.cost < found[0].state.cost
+    return again if better or found is None else found

@@ -14,7 +14,7 @@ from epigauge.multi_view.factorization import factorized
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import normalized
 from epigauge.multi_view.problem import BundleProblem
-from epigauge.multi_view.registration import registered
+from epigauge.multi_view.registration import TooFewInCommon, registered
 from epigauge.multi_view.system import Layout
 from epigauge.multi_view.tracks import Reconstruction, Tracks
 from epigauge.two_view.losses import EFFICIENT, Loss, median, robust_scale
@@ -92,7 +92,7 @@ def initialize(
     found, refused = None, None
     try:
         found = registered(tracks, frame, kernels, incremental, robust)
-    except ArgumentError as error:
+    except TooFewInCommon as error:
         if method == "registration":
             raise
         refused = error

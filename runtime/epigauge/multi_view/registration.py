@@ -23,10 +23,15 @@ from epigauge.two_view.geometry import canonical_cameras
 from epigauge.two_view.losses import EFFICIENT, Loss, median, robust_scale
 from epigauge.two_view.refine import refine_fundamental
 
-__all__ = ["registered"]
+__all__ = ["TooFewInCommon", "registered"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+
+
+class TooFewInCommon(ArgumentError):
+    """The tracks do not carry a camera over; factoring all views at once may do."""
+
 
 #: Pairs of views, those with most common points, that are tried as a start, and the fewest points.
 _PAIRS, _MATCHES = 40, 8
@@ -93,7 +98,7 @@ def _best_pair(tracks: Tracks, frame: Frame, robust: bool) -> tuple[int, int]:
     pairs = pairs[common.ravel()[pairs] >= _MATCHES]
     if not len(pairs):
         what = f"have no two views with {_MATCHES} common points"
-        raise ArgumentError("tracks", what, "longer tracks, or method='factorization'")
+        raise TooFewInCommon("tracks", what, "longer tracks, or method='factorization'")
     chosen = np.stack(np.unravel_index(pairs, common.shape), axis=1)
     rows = {view: _rows(tracks, view) for view in np.unique(chosen)}
     both = [np.flatnonzero((rows[i] >= 0) & (rows[k] >= 0)) for i, k in chosen]
@@ -198,7 +203,7 @@ class _Builder:
         view = int(np.argmax(np.where(pairs, self.common, 0.0).sum(axis=1) * pairs.sum(axis=1)))
         if np.count_nonzero(pairs[view]) < 2:
             outside = np.flatnonzero(~self.registered)[:5].tolist()
-            raise ArgumentError(
+            raise TooFewInCommon(
                 "tracks",
                 f"leave views {outside} with fewer than {MIN_POINTS} points in common with the "
                 f"others, and with {_MATCHES} matches in fewer than two of them",

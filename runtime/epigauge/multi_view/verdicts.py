@@ -49,6 +49,17 @@ _FEW, _COLUMNS, _ITERATIONS = 12, 4, 3
 #: Shift with which a singular matrix is factored; larger where conjugate gradients solve.
 _SHIFT, _SHIFT_ITERATIVE = 1e-12, 1e-5
 
+#: Noise, as a share of the RMS of the image coordinates, up to which a fit is one.
+_FITS = 0.05
+
+#: Root mean square over the noise that the median tells, above which few observations carry the
+#: cost: up to five in raw tracks that still lead to their optimum.
+_HEAVY = 8.0
+
+#: Least squares bends everything to an observation whose residual, as a share of the extent of the
+#: coordinates, is larger: below a fifth in raw tracks, above with two wrong in a thousand.
+_BEYOND = 0.2
+
 #: Share of single points that may be open without the rest being called undetermined.
 _OPEN = 0.05
 
@@ -77,7 +88,12 @@ class Verdict:
 
 
 def judged(
-    tracks: Tracks, found: Reconstruction, rejected: Mask, kernels: Table, workers: int = 1
+    tracks: Tracks,
+    found: Reconstruction,
+    rejected: Mask,
+    bends: bool,
+    kernels: Table,
+    workers: int = 1,
 ) -> Verdict:
     """Judge an adjusted reconstruction.
 
@@ -89,6 +105,8 @@ def judged(
         Cameras and points, at the minimum.
     rejected : ndarray of bool, shape (N,)
         Observations that do not count either.
+    bends : bool
+        Whether the loss lets few observations bend the result: least squares.
     kernels : Table
         Backend.
     workers : int
@@ -115,7 +133,13 @@ def judged(
     noise_px = robust_scale(distances) / 1.4826 / 1.1774 / float(np.sqrt(redundancy))
     information = max(weakest, 1e-300) * N / seen.n
     deviation = noise_px / Frame.of(tracks).scale / float(np.sqrt(information))
-    raised = set(parallax_flags(seen, noise_px))
+    # Where the fit is bad, nothing is within its noise.
+    fits = noise_px < _FITS * Frame.of(tracks).scale
+    raised = set(parallax_flags(seen, noise_px)) if fits else set()
+    heavy = float(np.sqrt(np.mean(distances**2) / 2.0)) > _HEAVY * noise_px
+    extent = float(np.ptp(seen.xy, axis=0).max())
+    if bends and (heavy or distances.max() > max(_BEYOND * extent, _HEAVY * noise_px)):
+        raised.add("gross errors")
     if of_cameras or of_points > _OPEN * seen.m:
         raised.add("undetermined")
     elif of_points or deviation > _WEAK:
@@ -168,13 +192,16 @@ def _open_directions(
     q = own.points_in(seen.xy, seen.view)
     P = own.cameras_in(seen.P)
     try:
-        problem = BundleProblem(kernels, layout, q, seen.weights, Loss(), workers=workers)
-        home = normalized().transformation(P, seen.Q)
-        P, Q = home.apply(P, seen.Q)
-        system = problem.linearize(BundleState(P, Q, 0.0, problem))
-        return _measured(system, problem, P, Q)
+        # Where a camera or a point is all but undefined, numbers overflow: it is open.
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            problem = BundleProblem(kernels, layout, q, seen.weights, Loss(), workers=workers)
+            home = normalized().transformation(P, seen.Q)
+            P, Q = home.apply(P, seen.Q)
+            system = problem.linearize(BundleState(P, Q, 0.0, problem))
+            found = _measured(system, problem, P, Q)
     except np.linalg.LinAlgError:
         return 1, 0, 0.0
+    return found if np.isfinite(found[2]) else (1, 0, 0.0)
 
 
 def _measured(
