@@ -19,7 +19,7 @@ from epigauge.two_view.losses import Loss
 from laws import distance
 
 # The package has a function of the same name.
-initialize_module = import_module("epigauge.multi_view.initialize")
+registration = import_module("epigauge.multi_view.registration")
 
 
 def median_residual(tracks: eg.Tracks, found: eg.Reconstruction, rows: np.ndarray) -> float:
@@ -116,7 +116,7 @@ def test_two_views_begin_with_the_backend_asked_for(
         asked.append(backend)
         return eg.refine_fundamental(*arguments, backend=backend, **options)
 
-    monkeypatch.setattr(initialize_module, "refine_fundamental", refine)
+    monkeypatch.setattr(registration, "refine_fundamental", refine)
     eg.initialize(many_views.observed(many_views.cameras_and_points(3, 20)), backend=name)
     assert asked == [name]
 
@@ -138,7 +138,7 @@ def test_views_with_too_few_common_points_are_named() -> None:
     h = np.einsum("kij,kj->ki", truth.P[view], truth.Q[point])
     tracks = eg.Tracks(view, point, h[:, :2] / h[:, 2:])
     with pytest.raises(ArgumentError, match=r"views \[3, 4\]"):
-        eg.initialize(tracks)
+        eg.initialize(tracks, method="registration")
 
 
 def test_no_pair_of_views_with_eight_common_points_is_refused() -> None:
@@ -149,7 +149,7 @@ def test_no_pair_of_views_with_eight_common_points_is_refused() -> None:
     truth = many_views.cameras_and_points(4, 28)
     h = np.einsum("kij,kj->ki", truth.P[view], truth.Q[points])
     with pytest.raises(ArgumentError, match="8 common points"):
-        eg.initialize(eg.Tracks(view, points, h[:, :2] / h[:, 2:]))
+        eg.initialize(eg.Tracks(view, points, h[:, :2] / h[:, 2:]), method="registration")
 
 
 def test_frame_conditions_and_comes_back() -> None:

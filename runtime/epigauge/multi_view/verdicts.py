@@ -56,6 +56,9 @@ _FITS = 0.05
 #: cost: up to five in raw tracks that still lead to their optimum.
 _HEAVY = 8.0
 
+#: Noise below this share of the extent of the coordinates is rounding.
+_EXACT = 1e-8
+
 #: Least squares bends everything to an observation whose residual, as a share of the extent of the
 #: coordinates, is larger: below a fifth in raw tracks, above with two wrong in a thousand.
 _BEYOND = 0.2
@@ -136,9 +139,10 @@ def judged(
     # Where the fit is bad, nothing is within its noise.
     fits = noise_px < _FITS * Frame.of(tracks).scale
     raised = set(parallax_flags(seen, noise_px)) if fits else set()
-    heavy = float(np.sqrt(np.mean(distances**2) / 2.0)) > _HEAVY * noise_px
     extent = float(np.ptp(seen.xy, axis=0).max())
-    if bends and (heavy or distances.max() > max(_BEYOND * extent, _HEAVY * noise_px)):
+    usual = _HEAVY * max(noise_px, _EXACT * extent)
+    heavy = float(np.sqrt(np.mean(distances**2) / 2.0)) > usual
+    if bends and (heavy or distances.max() > max(_BEYOND * extent, usual)):
         raised.add("gross errors")
     if of_cameras or of_points > _OPEN * seen.m:
         raised.add("undetermined")
