@@ -19,10 +19,12 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
         Matches,
         load_matches,
         load_reconstruction,
+        load_scene,
         load_tracks,
         save_matches,
         save_reconstruction,
         save_result,
+        save_scene,
         save_tracks,
     )
     from epigauge.kernels import backend, set_backend
@@ -88,6 +90,7 @@ __all__ = [
     "load_image",
     "load_matches",
     "load_reconstruction",
+    "load_scene",
     "load_tracks",
     "match_images",
     "multi_view_scene",
@@ -98,6 +101,7 @@ __all__ = [
     "save_matches",
     "save_reconstruction",
     "save_result",
+    "save_scene",
     "save_tracks",
     "set_backend",
     "triangulate",
@@ -112,8 +116,8 @@ _WHERE = {
     "errors": "ArgumentError BackendError EpigaugeError FileFormatError",
     "images": "ImageMatches load_image match_images",
     "io": (
-        "Matches load_matches load_reconstruction load_tracks "
-        "save_matches save_reconstruction save_result save_tracks"
+        "Matches load_matches load_reconstruction load_scene load_tracks "
+        "save_matches save_reconstruction save_result save_scene save_tracks"
     ),
     "kernels": "backend set_backend",
     "multi_view.adjust": "BundleResult bundle_adjust",

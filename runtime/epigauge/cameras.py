@@ -7,7 +7,7 @@ and kernels. Nothing here knows one model from another.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Kernel = Callable[..., Any]
 
-#: Focal lengths are accepted between these, in their unit: a wider range means a broken file, and a
+#: Lengths among the parameters are accepted between these: a wider range means a broken file, and a
 #: view of less than 1e-6 of a radian, where focal length and distance cannot be told apart.
 MIN_FOCAL, MAX_FOCAL = 1e-9, 1e9
 
@@ -37,6 +37,7 @@ MAX_SIZE = 1e15
 ORTHONORMAL = 1e-8
 
 _FOCAL = ("f", "fx", "fy", "c")
+_SIDES = ("width", "height")
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,10 @@ class CameraModel:
     camera_size, tangent_size, point_size : int
         Numbers that a camera (12 of its pose, then the parameters), its update and a point consist
         of.
+    tangent_names, gauge_names : tuple of str
+        Names of what an update consists of, and of the directions of space that change no image.
     gauge_dimension : int
-        Dimension of the group of space that changes no image: 7 for similarities.
+        Number of these directions: 7 for similarities.
     metric : bool
         Whether a camera has a rotation and a position.
     homogeneous : bool
@@ -70,6 +73,8 @@ class CameraModel:
     camera_size: int
     tangent_size: int
     point_size: int
+    tangent_names: tuple[str, ...]
+    gauge_names: tuple[str, ...]
     gauge_dimension: int
     metric: bool
     homogeneous: bool
@@ -83,6 +88,11 @@ class CameraModel:
     def focal(self) -> tuple[int, ...]:
         """Places of the focal lengths among the parameters."""
         return tuple(k for k, name in enumerate(self.params) if name in _FOCAL)
+
+    @property
+    def positive(self) -> tuple[int, ...]:
+        """Places of the parameters that are lengths: focal lengths, and sides of images."""
+        return tuple(k for k, name in enumerate(self.params) if name in (*_FOCAL, *_SIDES))
 
     def kernel(self, name: str, backend: str | None = None) -> Kernel:
         """Return a kernel of the model, as ``project`` or ``observe``, of a backend.
@@ -103,6 +113,12 @@ class CameraModel:
         return found
 
 
+_MODELS = {
+    name: CameraModel(**{field: getattr(row, field) for field in CameraModel.__dataclass_fields__})
+    for name, row in signatures.MODELS.items()
+}
+
+
 def models() -> dict[str, CameraModel]:
     """Return all camera models by name.
 
@@ -111,12 +127,7 @@ def models() -> dict[str, CameraModel]:
     dict of str to CameraModel
         In the order of the derivation.
     """
-    rows: Mapping[str, Any] = getattr(signatures, "MODELS", {})
-    fields = CameraModel.__dataclass_fields__
-    return {
-        name: CameraModel(**{field: getattr(row, field) for field in fields})
-        for name, row in rows.items()
-    }
+    return dict(_MODELS)
 
 
 def camera_model(name: str, argument: str = "model") -> CameraModel:
@@ -139,7 +150,7 @@ def camera_model(name: str, argument: str = "model") -> CameraModel:
     ArgumentError
         If there is none of this name; the message lists those there are.
     """
-    known = models()
+    known = _MODELS
     if isinstance(name, str) and name in known:
         return known[name]
     listed = ", ".join(known)
@@ -147,6 +158,39 @@ def camera_model(name: str, argument: str = "model") -> CameraModel:
     close = difflib.get_close_matches(str(name).lower(), lower, n=1)
     hint = f" (did you mean {lower[close[0]]!r}?)" if close else ""
     raise ArgumentError(argument, f"is {name!r:.60}", f"one of {listed}{hint}")
+
+
+def check_parameters(model: str, params: ArrayLike) -> Array:
+    """Check the parameters of cameras.
+
+    Parameters
+    ----------
+    model : str
+        Name of the camera model.
+    params : array_like, shape (c, k)
+        Parameters of each camera.
+
+    Returns
+    -------
+    ndarray, shape (c, k)
+        The same; do not write into it.
+
+    Raises
+    ------
+    ArgumentError
+        As `Cameras`.
+    """
+    known = camera_model(model)
+    array = _numbers("params", params, (len(known.params),), " ".join(known.params))
+    if not len(array):
+        raise ArgumentError("params", "has no row", "a row a camera")
+    for k in known.positive:
+        bad = np.flatnonzero(~((array[:, k] >= MIN_FOCAL) & (array[:, k] <= MAX_FOCAL)))
+        if len(bad):
+            was = f"has {known.params[k]} = {array[bad[0], k]:g} in row {bad[0]}"
+            needed = f"a length between {MIN_FOCAL:g} and {MAX_FOCAL:g}"
+            raise ArgumentError("params", was, needed)
+    return array
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,11 +224,7 @@ class Cameras:
     camera_of_view: Indices
 
     def __post_init__(self) -> None:
-        model = camera_model(self.model)
-        params = _numbers("params", self.params, (len(model.params),), " ".join(model.params))
-        if not len(params):
-            raise ArgumentError("params", "has no row", "a row a camera")
-        self._check_focal(model, params)
+        params = check_parameters(self.model, self.params)
         views = as_array("camera_of_view", self.camera_of_view, "an (n,) array")
         if views.ndim != 1 or views.dtype.kind not in "iu" or not len(views):
             was = f"is {views.dtype} {views.shape}"
@@ -197,18 +237,9 @@ class Cameras:
         if len(unused):
             was = f"names no view of camera {unused[0]}"
             raise ArgumentError("camera_of_view", was, "a view of every camera: drop other cameras")
-        object.__setattr__(self, "model", model.name)
+        object.__setattr__(self, "model", str(self.model))
         object.__setattr__(self, "params", _frozen(params))
         object.__setattr__(self, "camera_of_view", _frozen(views.astype(np.intp)))
-
-    @staticmethod
-    def _check_focal(model: CameraModel, params: Array) -> None:
-        for k in model.focal:
-            bad = np.flatnonzero(~((params[:, k] >= MIN_FOCAL) & (params[:, k] <= MAX_FOCAL)))
-            if len(bad):
-                was = f"has {model.params[k]} = {params[bad[0], k]:g} for camera {bad[0]}"
-                needed = f"a focal length between {MIN_FOCAL:g} and {MAX_FOCAL:g}"
-                raise ArgumentError("params", was, needed)
 
     @property
     def of_views(self) -> Array:
@@ -422,7 +453,8 @@ def _numbers(name: str, value: ArrayLike, shape: tuple[int, ...], what: str) -> 
     array = as_real(name, value, needed)
     if array.ndim != 1 + len(shape) or array.shape[1:] != shape:
         raise ArgumentError(name, f"has shape {array.shape}", needed)
-    bad = np.flatnonzero(~(np.abs(array) <= MAX_SIZE).reshape(len(array), -1).all(axis=1))
+    entries = tuple(range(1, array.ndim))
+    bad = np.flatnonzero(~(np.abs(array) <= MAX_SIZE).all(axis=entries))
     if len(bad):
         row = array[bad[0]]
         worst = row[~(np.abs(row) <= MAX_SIZE)][0]

@@ -8,11 +8,13 @@ Files are written under a temporary name and moved into place: a half-written on
 
 from __future__ import annotations
 
-from epigauge.io._colmap_text import save_colmap_model
+from epigauge.io._colmap_pinhole import save_colmap_model
 from epigauge.io._common import MAX_MATCHES
+from epigauge.io._scene import ColmapSource, SceneSource
 from epigauge.io.matches import Matches, load_matches, save_matches
 from epigauge.io.output import plain, save_result, writing
 from epigauge.io.ply import save_ply
+from epigauge.io.scene_files import load_scene, save_scene
 from epigauge.io.tracks import (
     TrackFile,
     load_reconstruction,
@@ -24,10 +26,13 @@ from epigauge.io.tracks import (
 
 __all__ = [
     "MAX_MATCHES",
+    "ColmapSource",
     "Matches",
+    "SceneSource",
     "TrackFile",
     "load_matches",
     "load_reconstruction",
+    "load_scene",
     "load_track_file",
     "load_tracks",
     "plain",
@@ -36,6 +41,7 @@ __all__ = [
     "save_ply",
     "save_reconstruction",
     "save_result",
+    "save_scene",
     "save_tracks",
     "writing",
 ]

@@ -1,9 +1,9 @@
 """Bundle Adjustment in the Large: cameras, points and observations as text.
 
 A line ``views points observations``; a line ``view point x y`` an observation; then 9 numbers a
-camera (rotation as a Rodrigues vector, translation, f, k1, k2) and 3 a point. A camera projects
-x = -f X / Z, with X = R Q + t: its matrix is diag(-f, -f, 1) (R | t). The distortion k1, k2 has
-no place in a projective camera: it is ignored in reading and written as 0.
+camera (rotation as a Rodrigues vector, translation, f, k1, k2) and 3 a point. Without distortion a
+camera projects x = -f X / Z, with X = R Q + t: its matrix is diag(-f, -f, 1) (R | t). Where
+projective cameras are asked for, k1 and k2 are ignored; where they are written, they are 0.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._common import MAX_MATCHES
 from epigauge.io._npz import damage
-from epigauge.io._rotations import quaternion
+from epigauge.io._rotations import from_rodrigues, rodrigues
 from epigauge.io._text import numbers, text_lines
 from epigauge.multi_view.tracks import Reconstruction, Tracks
 
@@ -43,7 +43,7 @@ def read_bal(path: Path, file: IO[bytes]) -> dict[str, Any]:
     Returns
     -------
     dict
-        Arrays view, point (N,), xy (N, 2), P (n, 3, 4), Q (m, 4).
+        Arrays view, point (N,), xy (N, 2), cameras (n, 9), X (m, 3).
 
     Raises
     ------
@@ -68,12 +68,12 @@ def read_bal(path: Path, file: IO[bytes]) -> dict[str, Any]:
         "view": observations[:, 0].astype(np.intp),
         "point": observations[:, 1].astype(np.intp),
         "xy": observations[:, 2:].copy(),
-        "P": _cameras(values[end_views:end_cameras].reshape(n, 9)),
-        "Q": np.column_stack([points, np.ones(m)]),
+        "cameras": values[end_views:end_cameras].reshape(n, 9),
+        "X": points,
     }
 
 
-def write_bal(file: IO[bytes], tracks: Tracks, reconstruction: Reconstruction) -> None:
+def write_bal(file: IO[bytes], tracks: Tracks, cameras: Array, points: Array) -> None:
     """Write a problem; weights have no place in it.
 
     Parameters
@@ -82,8 +82,40 @@ def write_bal(file: IO[bytes], tracks: Tracks, reconstruction: Reconstruction) -
         Where to.
     tracks : Tracks
         Observations.
+    cameras : ndarray, shape (n, 9)
+        Rodrigues vector, translation, f, k1, k2.
+    points : ndarray, shape (m, 3)
+        Points.
+    """
+    file.write(f"{tracks.n_views} {tracks.n_points} {len(tracks)}\n".encode())
+    for view, point, (x, y) in zip(
+        tracks.view.tolist(), tracks.point.tolist(), tracks.xy.tolist(), strict=True
+    ):
+        file.write(f"{view} {point} {x!r} {y!r}\n".encode())
+    for value in [*cameras.ravel().tolist(), *points.ravel().tolist()]:
+        file.write(f"{value!r}\n".encode())
+
+
+def projective_cameras(cameras: Array) -> Array:
+    """Return diag(-f, -f, 1) (R | t) of nine numbers a camera; its distortion is left out."""
+    with np.errstate(all="ignore"):
+        P = np.concatenate([from_rodrigues(cameras[:, :3]), cameras[:, 3:6, None]], axis=2)
+        P[:, :2] *= -cameras[:, 6, None, None]
+    return np.asarray(P)
+
+
+def nine_numbers(reconstruction: Reconstruction) -> tuple[Array, Array]:
+    """Return what BAL holds of projective cameras and points.
+
+    Parameters
+    ----------
     reconstruction : Reconstruction
         Its cameras must be diag(-f, -f, 1) (R | t) up to scale, its points finite.
+
+    Returns
+    -------
+    cameras, points : ndarray, shape (n, 9), (m, 3)
+        Without distortion.
 
     Raises
     ------
@@ -94,14 +126,7 @@ def write_bal(file: IO[bytes], tracks: Tracks, reconstruction: Reconstruction) -
     if len(at_infinity):
         raise ArgumentError("start", f"has point {at_infinity[0]} at infinity", "finite points")
     cameras = [_nine_numbers(i, P) for i, P in enumerate(reconstruction.P)]
-    points = reconstruction.Q[:, :3] / reconstruction.Q[:, 3:]
-    file.write(f"{tracks.n_views} {tracks.n_points} {len(tracks)}\n".encode())
-    for view, point, (x, y) in zip(
-        tracks.view.tolist(), tracks.point.tolist(), tracks.xy.tolist(), strict=True
-    ):
-        file.write(f"{view} {point} {x!r} {y!r}\n".encode())
-    for value in np.concatenate([np.ravel(cameras), points.ravel()]).tolist():
-        file.write(f"{value!r}\n".encode())
+    return np.array(cameras), reconstruction.Q[:, :3] / reconstruction.Q[:, 3:]
 
 
 def _numbers(
@@ -147,19 +172,6 @@ def _counts(path: Path, fields: list[str], line: int) -> list[int]:
     return counts
 
 
-def _cameras(nine: Array) -> Array:
-    """Return diag(-f, -f, 1) (R | t)."""
-    with np.errstate(all="ignore"):
-        angle = np.linalg.norm(nine[:, :3], axis=1)[:, None, None]
-        cross = np.cross(np.eye(3)[None], nine[:, None, :3])
-        # R = I + sin(a) / a [w]x + (1 - cos(a)) / a^2 [w]x^2
-        half = np.sinc(angle / (2.0 * np.pi)) ** 2 / 2.0
-        R = np.eye(3) + np.sinc(angle / np.pi) * cross + half * (cross @ cross)
-        P = np.concatenate([R, nine[:, 3:6, None]], axis=2)
-        P[:, :2] *= -nine[:, 6, None, None]
-    return np.asarray(P)
-
-
 def _nine_numbers(i: int, P: Array) -> Array:
     """Return the numbers of one camera."""
     M = P / (np.sign(np.linalg.det(P[:, :3])) * np.linalg.norm(P[2, :3]) or 1.0)
@@ -173,14 +185,4 @@ def _nine_numbers(i: int, P: Array) -> Array:
             f"has camera {i} away from diag(-f, -f, 1) (R | t) by {error:.1g}",
             "cameras of this form; NPZ holds every camera",
         )
-    return np.asarray(np.concatenate([_rodrigues(scaled[:, :3]), scaled[:, 3], [f, 0.0, 0.0]]))
-
-
-def _rodrigues(R: Array) -> Array:
-    """Return the axis of a rotation times its angle, by its quaternion."""
-    w, *axis = quaternion(R)
-    sine = float(np.linalg.norm(axis))
-    if sine == 0.0:
-        return np.zeros(3)
-    angle = 2.0 * float(np.arctan2(sine, abs(w))) * (-1.0 if w < 0.0 else 1.0)
-    return np.array(axis) * (angle / sine)
+    return np.asarray(np.concatenate([rodrigues(scaled[:, :3]), scaled[:, 3], [f, 0.0, 0.0]]))

@@ -124,18 +124,18 @@ def text_lines(path: Path, file: IO[bytes]) -> Iterator[tuple[int, str, str]]:
     line = 0
     while raw := file.readline(_MAX_LINE + 1):
         line += 1
-        text, _, comment = _decoded(path, raw, line).partition("#")
+        text, _, comment = decoded(path, raw, line).partition("#")
         yield line, text.strip(), comment.strip()
 
 
-def _decoded(path: Path, raw: bytes, line: int) -> str:
+def decoded(path: Path, raw: bytes, line: int, longest: int = _MAX_LINE) -> str:
     """Decode one line of text."""
     if line == 1 and raw.startswith((b"PK\x03\x04", b"\xff\xfe", b"\xfe\xff")):
         remedy = "name it .npz" if raw.startswith(b"PK") else "save it as UTF-8 text"
         kind = "a ZIP archive" if raw.startswith(b"PK") else "UTF-16 text"
         raise FileFormatError(path, f"is {kind}: {remedy}")
-    if len(raw) > _MAX_LINE:
-        raise FileFormatError(path, f"line longer than {_MAX_LINE} bytes", line)
+    if len(raw) > longest:
+        raise FileFormatError(path, f"line longer than {longest} bytes", line)
     try:
         return raw.decode("utf-8-sig" if line == 1 else "utf-8")
     except UnicodeDecodeError:

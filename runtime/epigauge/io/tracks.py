@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.errors import ArgumentError, FileFormatError
-from epigauge.io._bal import read_bal, write_bal
+from epigauge.io._bal import nine_numbers, projective_cameras, read_bal, write_bal
 from epigauge.io._common import MAX_MATCHES, PathLike, check_suffix, listed
 from epigauge.io._npz import read_npz, write_npz
 from epigauge.io._text import Columns, read_text
@@ -118,7 +118,7 @@ def load_track_file(
     found = _read(path, with_start)
     if "view" not in found:
         raise FileFormatError(path, "holds a reconstruction but no tracks: view, point and xy")
-    view, point, xy = _observations(path, found)
+    view, point, xy = check_observations(path, found)
     keep = _kept(path, found, view, point, clean, views)
     start = _reconstruction(path, found)
     weights = found.get("weights")
@@ -209,8 +209,8 @@ def save_tracks(path: PathLike, tracks: Tracks, start: Reconstruction | None = N
             _write_csv(file, tracks)
         else:
             assert start is not None
-            with _compressing(file, form) as stream:
-                write_bal(stream, tracks, start)
+            with compressing(file, form) as stream:
+                write_bal(stream, tracks, *nine_numbers(start))
 
 
 def save_reconstruction(path: PathLike, reconstruction: Reconstruction) -> None:
@@ -264,11 +264,12 @@ def _read(path: Path, with_start: bool) -> dict[str, Any]:
             found["xy"] = np.column_stack([columns["x"], columns["y"]])
             found |= {"weights": columns["weight"]} if "weight" in columns else {}
             return found | ({"clean_rows": columns["clean"]} if "clean" in columns else {})
-        with _decompressing(file, form) as stream:
-            return read_bal(path, stream)
+        with decompressing(file, form) as stream:
+            problem = read_bal(path, stream)
+    return problem | {"P": projective_cameras(problem.pop("cameras"))}
 
 
-def _observations(path: Path, found: dict[str, Any]) -> tuple[Any, Any, Any]:
+def check_observations(path: Path, found: dict[str, Any]) -> tuple[Any, Any, Any]:
     """Check what must hold before indices are used as sizes of arrays."""
     view, point, xy = (found[name] for name in _TRACKS)
     for name, index in (("view", view), ("point", point)):
@@ -352,14 +353,16 @@ def _write_csv(file: IO[bytes], tracks: Tracks) -> None:
         file.write((",".join(map(repr, row)) + "\n").encode())
 
 
-def _decompressing(file: IO[bytes], form: str) -> AbstractContextManager[Any]:
-    if form == ".txt":
+def decompressing(file: IO[bytes], form: str) -> AbstractContextManager[Any]:
+    """Return a stream of the content of a file whose suffix is given."""
+    if not form.endswith(("gz", "bz2")):
         return nullcontext(file)
     return gzip.GzipFile("", "rb", fileobj=file) if form.endswith("gz") else bz2.BZ2File(file)
 
 
-def _compressing(file: IO[bytes], form: str) -> AbstractContextManager[Any]:
-    if form == ".txt":
+def compressing(file: IO[bytes], form: str) -> AbstractContextManager[Any]:
+    """Return a stream into a file whose suffix is given."""
+    if not form.endswith(("gz", "bz2")):
         return nullcontext(file)
     # No date in the file: the same content gives the same bytes.
     if form.endswith("gz"):

@@ -1,0 +1,230 @@
+"""Scenes, that is tracks with cameras and points, in files: COLMAP folders, BAL problems, NPZ."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge._arguments import as_choice
+from epigauge.cameras import MetricReconstruction
+from epigauge.errors import ArgumentError, FileFormatError
+from epigauge.io._bal import read_bal, write_bal
+from epigauge.io._colmap_binary import read_binary, write_binary
+from epigauge.io._colmap_parts import FILES, ColmapModel
+from epigauge.io._colmap_scene import model_of, raw_scene
+from epigauge.io._colmap_text import read_text_model, write_text_model
+from epigauge.io._common import PathLike
+from epigauge.io._npz_scene import read_npz_scene, write_npz_scene
+from epigauge.io._rotations import from_rodrigues, rodrigues
+from epigauge.io._scene import RawScene, SceneSource, finished
+from epigauge.io.output import writing
+from epigauge.io.tracks import compressing, decompressing
+from epigauge.multi_view.tracks import Tracks
+
+__all__ = ["load_scene", "save_scene"]
+
+Array = NDArray[np.float64]
+
+#: Files of BAL problems; the form of others is told by their last suffix.
+_BAL = (".txt", ".bal", ".bz2", ".gz")
+_REPEATED = ("keep", "first", "refuse")
+_WEAK = ("drop", "refuse")
+
+
+def load_scene(
+    path: PathLike, *, repeated: str = "keep", weak: str = "drop"
+) -> tuple[Tracks, MetricReconstruction]:
+    """Read a scene: observations, calibrated cameras, points.
+
+    A directory is a COLMAP model, binary (``cameras.bin``, ``images.bin``, ``points3D.bin``) or
+    text; with ``rigs`` and ``frames`` of COLMAP 3.12 and later, these have the poses. Pixels stay
+    COLMAP's, with (0.5, 0.5) in the middle of the first one. A file ``.txt``, ``.txt.bz2`` or
+    ``.txt.gz`` is a problem of "Bundle Adjustment in the Large", its cameras of the model ``bal``.
+    ``.npz`` is what `save_scene` writes.
+
+    Parameters
+    ----------
+    path : str or path
+        A directory or a file.
+    repeated : {"keep", "first", "refuse"}
+        What to do with further observations of a point in one view: keep them (`Tracks.n_repeated`
+        counts them), leave all but the first of the file out, or refuse the file.
+    weak : {"drop", "refuse"}
+        What to do with points that fewer than two views see, and with views that see none of the
+        others: leave them out and number the rest anew in the same order, or refuse the file.
+
+    Returns
+    -------
+    tracks : Tracks
+        Observations, with names and sizes of images and colours of points where the file has them.
+        ``tracks.source.notes`` says what was left out or changed; its other content lets
+        `save_scene` write what else the file held.
+    reconstruction : MetricReconstruction
+        Cameras and points of the tracks.
+
+    Raises
+    ------
+    FileFormatError
+        If that is no scene, naming file, and line or record where there is one.
+    OSError
+        If it cannot be read.
+
+    Notes
+    -----
+    Cameras of different models in one COLMAP folder become cameras of the poorest model that holds
+    them all exactly (SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV); other
+    mixtures are refused.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> tracks, reconstruction = eg.load_scene("sparse/0")  # doctest: +SKIP
+    >>> tracks.source.notes  # doctest: +SKIP
+    ('second sightings of a point in a view: 9743, kept',)
+    """
+    path = Path(path)
+    as_choice("repeated", repeated, _REPEATED)
+    as_choice("weak", weak, _WEAK)
+    if path.is_dir():
+        raw = raw_scene(path, _read_folder(path))
+    elif path.suffix.lower() == ".npz":
+        raw = read_npz_scene(path)
+    elif path.suffix.lower() in _BAL:
+        raw = _read_bal(path)
+    else:
+        was = f"is {str(path)!r}"
+        raise ArgumentError("path", was, f"a COLMAP folder, or a name ending in .npz, {_listed()}")
+    return finished(path, raw, repeated, weak)
+
+
+def save_scene(
+    path: PathLike,
+    tracks: Tracks,
+    reconstruction: MetricReconstruction,
+    *,
+    text: bool = False,
+    rigs: str = "keep",
+) -> None:
+    """Write a scene so that `load_scene` reads the same again, every number to its last digit.
+
+    Parameters
+    ----------
+    path : str or path
+        ``.npz`` holds everything; ``.txt``, ``.txt.bz2`` or ``.txt.gz`` is a BAL problem; another
+        name without these suffixes is a COLMAP folder, which is made if absent.
+    tracks : Tracks
+        Observations. Those of `load_scene` keep COLMAP's numbers of images, cameras and points, its
+        features without points, rigs and frames.
+    reconstruction : MetricReconstruction
+        Of the same views and points.
+    text : bool
+        Write a COLMAP folder as text, not binary.
+    rigs : {"keep", "drop"}
+        ``"keep"`` refuses images of a rig that no longer keep its poses; ``"drop"`` makes every
+        image a frame of its own.
+
+    Raises
+    ------
+    ArgumentError
+        Naming what the form has no place for. COLMAP: weights, other models of cameras, images of
+        several sizes by one camera. BAL: weights, cameras of several views, another model than
+        ``bal``, names, sizes and colours.
+    OSError
+        If it cannot be written.
+
+    Notes
+    -----
+    The rotation matrices are written as quaternions or Rodrigues vectors, which rounds them in the
+    last digit; those that have not changed since `load_scene` are written as they were.
+    """
+    path = Path(path)
+    as_choice("rigs", rigs, ("keep", "drop"))
+    if (reconstruction.n_views, reconstruction.n_points) != (tracks.n_views, tracks.n_points):
+        was = f"has {reconstruction.n_views} views and {reconstruction.n_points} points"
+        needed = f"{tracks.n_views} and {tracks.n_points}, as the tracks"
+        raise ArgumentError("reconstruction", was, needed)
+    suffix = path.suffix.lower()
+    if suffix == ".npz" and not path.is_dir():
+        write_npz_scene(path, tracks, reconstruction)
+    elif suffix in _BAL and not path.is_dir():
+        cameras = _nine_numbers(tracks, reconstruction)
+        with writing(path) as file, compressing(file, suffix) as stream:
+            write_bal(stream, tracks, cameras, reconstruction.X)
+    else:
+        _write_folder(path, tracks, reconstruction, text, rigs)
+
+
+def _listed() -> str:
+    return " or ".join(_BAL)
+
+
+def _read_folder(path: Path) -> ColmapModel:
+    if (path / "cameras.bin").exists():  # as COLMAP chooses
+        return read_binary(path)
+    if (path / "cameras.txt").exists():
+        return read_text_model(path)
+    raise FileFormatError(path, "is no COLMAP model: it holds neither cameras.bin nor cameras.txt")
+
+
+def _write_folder(
+    path: Path, tracks: Tracks, reconstruction: MetricReconstruction, text: bool, rigs: str
+) -> None:
+    model = model_of(tracks, reconstruction, rigs)
+    suffix, other = (".txt", ".bin") if text else (".bin", ".txt")
+    stale = path / f"cameras{other}"
+    if stale.exists():
+        was = f"is {str(path)!r}, which holds {stale.name} of another model"
+        raise ArgumentError("path", was, f"an empty folder, or text={not text}")
+    path.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        files = {name: stack.enter_context(writing(path / (name + suffix))) for name in FILES}
+        if text:
+            write_text_model(files, model)
+        else:
+            write_binary(files, model)
+
+
+def _read_bal(path: Path) -> RawScene:
+    with path.open("rb") as file, decompressing(file, path.suffix.lower()) as stream:
+        found = read_bal(path, stream)
+    nine = found["cameras"]
+    return RawScene(
+        found["view"],
+        found["point"],
+        found["xy"],
+        from_rodrigues(nine[:, :3]),
+        nine[:, 3:6],
+        found["X"],
+        "bal",
+        nine[:, 6:],
+        np.arange(len(nine)),
+        source=SceneSource(rotations=nine[:, :3]),
+    )
+
+
+def _nine_numbers(tracks: Tracks, reconstruction: MetricReconstruction) -> Array:
+    """Return what BAL holds of a scene's cameras, (n, 9)."""
+    cameras = reconstruction.cameras
+    if cameras.model != "bal":
+        was = f"has cameras of the model {cameras.model!r}"
+        raise ArgumentError("reconstruction", was, "'bal': a BAL problem has no other; NPZ has all")
+    if len(cameras) < tracks.n_views:
+        was = f"has {len(cameras)} cameras for {tracks.n_views} views"
+        needed = "a camera a view: Cameras('bal', cameras.of_views, range(n)); NPZ keeps them"
+        raise ArgumentError("reconstruction", was, needed)
+    if (tracks.weights != 1.0).any():
+        raise ArgumentError("tracks.weights", "are not all one", "ones; NPZ keeps them")
+    for name in ("names", "sizes", "colours"):
+        if getattr(tracks, name) is not None:
+            raise ArgumentError(f"tracks.{name}", "are given", "None: BAL has no place for them")
+    w = rodrigues(reconstruction.R)
+    source = tracks.source
+    if isinstance(source, SceneSource) and source.rotations is not None:
+        old = source.rotations
+        if old.shape == w.shape:
+            same = (from_rodrigues(old) == reconstruction.R).all(axis=(1, 2))
+            w[same] = old[same]
+    return np.asarray(np.column_stack([w, reconstruction.t, cameras.of_views]))
