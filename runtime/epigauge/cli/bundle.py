@@ -27,6 +27,7 @@ from epigauge.cli._common import (
     write_json,
 )
 from epigauge.cli._live import watching
+from epigauge.cli._scenes import FixView, Refine, Rigs, SceneJob, refuse_options, save_cloud
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import (
     TrackFile,
@@ -34,15 +35,14 @@ from epigauge.io import (
     load_track_file,
     plain,
     save_colmap_model,
-    save_ply,
     save_result,
 )
+from epigauge.io.scene_files import is_scene
 from epigauge.io.tracks import arrays_of
 from epigauge.multi_view.display import Display, display
 from epigauge.multi_view.pinhole import PinholeModel, pinhole_model
 
 _GAUGES = ("reference_camera", "two_cameras", "five_points", "normalized")
-_POINT, _CAMERA = (90, 140, 190), (224, 122, 31)
 #: Tracks in these files have y down, those of BAL problems y up.
 _Y_DOWN = (".npz", ".csv")
 
@@ -52,7 +52,10 @@ Backend = Annotated[str | None, typer.Option(help="c, numpy or casadi; see `epig
 Start = Annotated[Path | None, typer.Option(help="NPZ or BAL with cameras and points to begin at.")]
 TracksFile = Annotated[
     Path,
-    typer.Argument(help="NPZ, CSV (view, point, x, y) or BAL (.txt, .bz2).", show_default=False),
+    typer.Argument(
+        help="NPZ, CSV (view, point, x, y), BAL (.txt, .bz2), or a COLMAP folder.",
+        show_default=False,
+    ),
 ]
 
 
@@ -77,7 +80,9 @@ def bundle(
     ] = None,
     output: Annotated[
         list[Path] | None,
-        typer.Option("--output", "-o", help="NPZ: everything. PLY: a cloud to look at."),
+        typer.Option(
+            "--output", "-o", help="NPZ: everything. PLY: a cloud to look at. Of scenes: any form."
+        ),
     ] = None,
     colmap: Annotated[
         Path | None, typer.Option(help="Directory for a COLMAP text model with pinhole cameras.")
@@ -91,9 +96,12 @@ def bundle(
             show_default=False,
         ),
     ] = None,
+    refine: Refine = None,
+    fix_view: FixView = None,
+    rigs: Rigs = "keep",
     json: Json = False,
 ) -> int:
-    """Adjust the cameras and points of a file of tracks.
+    """Adjust the cameras and points of a file of tracks, or of a scene.
 
     Starts from two views and registers the others in turn, or from random
     cameras where that fails, and minimises the reprojection error in a
@@ -101,13 +109,25 @@ def bundle(
     line of 12 numbers each, row by row; with --json everything known.
     --plot and -o may be given several times.
 
-    Pictures, PLY and COLMAP models use a basis in which the scene looks
+    A scene is a COLMAP folder, an NPZ file of `eg.save_scene` or, with
+    --refine, a BAL file: it has calibrated cameras and points to begin with,
+    which stay of their model. -o then takes a folder (COLMAP), .txt or .txt.bz2 (BAL)
+    too; stdout has R | t row by row and the parameters of each view.
+
+    Else pictures, PLY and COLMAP models use a basis in which the scene looks
     plausible: that is no calibration, and nothing can be measured in it.
 
     Ctrl-C stops after the evaluation being done: the best estimate so far is
     reported and saved as asked, with exit code 130.
     """
     plots, outputs = plot or [], output or []
+    if refine is not None or is_scene(tracks):
+        others = {"gauge": gauge, "start": start, "colmap": colmap, "clean": clean or None}
+        asked = {"method": method, "damping": damping, "loss": loss, "max_iter": max_iter}
+        asked |= {"backend": backend, "gauge_mode": gauge_mode}
+        refuse_options(others)
+        scene = SceneJob(tracks, refine, fix_view or [], rigs, y_up)
+        return scene.run(asked, plots, outputs, json)
     for path in plots:
         check_target(path, ".png", ".svg", ".html")
     for path in outputs:
@@ -228,14 +248,8 @@ class _Answer:
             save_result(path, self.result, **arrays_of(self.file.tracks), **self.more())
             return
         frame = self.frame
-        points = frame.points[frame.shown]
-        counts = [len(points), len(frame.centres)]
-        save_ply(
-            path,
-            np.vstack([points, frame.centres]),
-            np.repeat(np.array([_POINT, _CAMERA], np.uint8), counts, 0),
-            "points blue, cameras orange; a basis to look at, not a calibration",
-        )
+        note = "points blue, cameras orange; a basis to look at, not a calibration"
+        save_cloud(path, frame.points[frame.shown], frame.centres, note)
 
     def draw(self, path: Path) -> None:
         """Draw a picture, or write a page."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -24,6 +24,7 @@ from epigauge.cli._common import (
     write_json,
 )
 from epigauge.cli._live import watching
+from epigauge.cli._scenes import FixView, Refine, SceneJob, refuse_options
 from epigauge.cli.bundle import (
     Backend,
     Clean,
@@ -32,7 +33,8 @@ from epigauge.cli.bundle import (
     TracksFile,
     first_reconstruction,
 )
-from epigauge.io import load_track_file
+from epigauge.io import TrackFile, load_track_file
+from epigauge.io.scene_files import is_scene
 from epigauge.multi_view.compare import Comparison
 from epigauge.multi_view.strategies import STRATEGIES
 
@@ -50,9 +52,11 @@ def compare(
     markdown: Annotated[
         bool, typer.Option("--markdown", help="Write the table to stdout as Markdown.")
     ] = False,
+    refine: Refine = None,
+    fix_view: FixView = None,
     json: Json = False,
 ) -> int:
-    """Adjust the same tracks from the same start by several methods.
+    """Adjust the same tracks, or the same scene, from the same start by several methods.
 
     Exit code 1 if the default method or, without it, none converged.
 
@@ -62,17 +66,22 @@ def compare(
     if plot is not None:
         check_target(plot, ".png", ".svg")
     out = console()
-    file = load_track_file(tracks, clean)
+    observed: TrackFile | SceneJob
+    if refine is not None or is_scene(tracks):
+        refuse_options({"clean": clean or None, "start": start})
+        observed = SceneJob(tracks, refine, fix_view or [])
+    else:
+        observed = load_track_file(tracks, clean)
     chosen = methods if methods == "all" else [name.strip() for name in methods.split(",")]
-    with watching(out, len(file.tracks), "first reconstruction", not json) as watch:
+    with watching(out, len(observed.tracks), "first reconstruction", not json) as watch:
+        options: dict[str, Any] = {"max_iter": max_iter, "backend": backend}
+        if isinstance(observed, SceneJob):
+            options |= {"refine": observed.refine, "fixed_views": observed.fixed}
+            first: Any = observed.start
+        else:
+            first = first_reconstruction(observed, tracks, start, backend)
         comparison = eg.compare(
-            file.tracks,
-            chosen,
-            first_reconstruction(file, tracks, start, backend),
-            on_method=watch.begin,
-            callback=watch,
-            max_iter=max_iter,
-            backend=backend,
+            observed.tracks, chosen, first, on_method=watch.begin, callback=watch, **options
         )
     if plot is not None:
         from epigauge.plots import save_figure
@@ -89,7 +98,7 @@ def compare(
     elif markdown:
         typer.echo(comparison.to_markdown(), nl=False)
     else:
-        size = f"{file.tracks.n_views} views, {file.tracks.n_points} points"
+        size = f"{observed.tracks.n_views} views, {observed.tracks.n_points} points"
         print_table(out, comparison, f"{shown(tracks)}: {size}")
     if watch.interrupted:
         done = f"[bold red]interrupted[/] at {comparison.rows[-1].method}: this is what was done"

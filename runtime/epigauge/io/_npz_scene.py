@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,7 +30,21 @@ _COLMAP = (*(f"colmap_{name}" for name in _IDS), "colmap_features", "colmap_feat
 _TEXTS = ("colmap_cameras", "colmap_rigs", "colmap_frames")
 
 
-def write_npz_scene(path: Path, tracks: Tracks, reconstruction: MetricReconstruction) -> None:
+def is_npz_scene(path: Path) -> bool:
+    """Tell whether a file names the arrays of a scene, rather than of tracks alone."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {f"{name}.npy" for name in _NEEDED} <= set(archive.namelist())
+    except zipfile.BadZipFile:
+        return False
+
+
+def write_npz_scene(
+    path: Path,
+    tracks: Tracks,
+    reconstruction: MetricReconstruction,
+    more: Mapping[str, Any] | None = None,
+) -> None:
     """Write a scene.
 
     Parameters
@@ -40,6 +55,8 @@ def write_npz_scene(path: Path, tracks: Tracks, reconstruction: MetricReconstruc
         Observations.
     reconstruction : MetricReconstruction
         Of the same views and points.
+    more : mapping of str to array_like, optional
+        Further arrays, under other names.
     """
     cameras = reconstruction.cameras
     arrays: dict[str, Any] = arrays_of(tracks) | {
@@ -61,7 +78,7 @@ def write_npz_scene(path: Path, tracks: Tracks, reconstruction: MetricReconstruc
         arrays |= {} if source.rotations is None else {"rotations": source.rotations}
         arrays |= {} if source.colmap is None else _colmap_arrays(source.colmap)
     with writing(path) as file:
-        write_npz(file, arrays)
+        write_npz(file, {**(more or {}), **arrays})
 
 
 def _colmap_arrays(colmap: ColmapSource) -> dict[str, Any]:

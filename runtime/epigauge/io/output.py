@@ -55,7 +55,7 @@ def save_result(path: PathLike, result: Any, **more: Any) -> None:
             file.write(json_text(plain(result) | plain(more)).encode() + b"\n")
         else:
             arrays: dict[str, Any] = {
-                name: np.asarray(value) for name, value in (_arrays(result) | more).items()
+                name: np.asarray(value) for name, value in (arrays_of_result(result) | more).items()
             }
             pickled = [name for name, array in arrays.items() if array.dtype.hasobject]
             if pickled:
@@ -145,7 +145,7 @@ def _opened(temporary: Path, path: PathLike) -> IO[bytes]:
         raise
 
 
-def _arrays(result: Any) -> dict[str, Any]:
+def arrays_of_result(result: Any) -> dict[str, Any]:
     """Turn a result into arrays for NPZ; rows of a history into columns."""
     arrays: dict[str, Any] = {}
     for field in _fields(result):
@@ -154,7 +154,7 @@ def _arrays(result: Any) -> dict[str, Any]:
             for column in _fields(value[0]):
                 arrays[f"{field.name}_{column.name}"] = [getattr(row, column.name) for row in value]
         elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-            arrays |= _arrays(value)
+            arrays |= arrays_of_result(value)
         elif value is not None:
             arrays[field.name] = value
     return arrays

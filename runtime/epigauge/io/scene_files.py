@@ -17,7 +17,7 @@ from epigauge.io._colmap_parts import FILES, ColmapModel
 from epigauge.io._colmap_scene import model_of, raw_scene
 from epigauge.io._colmap_text import read_text_model, write_text_model
 from epigauge.io._common import PathLike
-from epigauge.io._npz_scene import read_npz_scene, write_npz_scene
+from epigauge.io._npz_scene import is_npz_scene, read_npz_scene, write_npz_scene
 from epigauge.io._rotations import from_rodrigues, rodrigues
 from epigauge.io._scene import RawScene, SceneSource, finished
 from epigauge.io.output import writing
@@ -141,20 +141,42 @@ def save_scene(
     last digit; those that have not changed since `load_scene` are written as they were.
     """
     path = Path(path)
+    content = scene_content(path, tracks, reconstruction, rigs)
+    if content is None:
+        write_npz_scene(path, tracks, reconstruction)
+    elif isinstance(content, ColmapModel):
+        _write_folder(path, content, text)
+    else:
+        with writing(path) as file, compressing(file, path.suffix.lower()) as stream:
+            write_bal(stream, tracks, content, reconstruction.X)
+
+
+def scene_content(
+    path: Path, tracks: Tracks, reconstruction: MetricReconstruction, rigs: str = "keep"
+) -> ColmapModel | Array | None:
+    """Return what is written to a path: a COLMAP model, BAL's cameras, or None for NPZ.
+
+    Raises
+    ------
+    ArgumentError
+        As `save_scene`.
+    """
     as_choice("rigs", rigs, ("keep", "drop"))
     if (reconstruction.n_views, reconstruction.n_points) != (tracks.n_views, tracks.n_points):
         was = f"has {reconstruction.n_views} views and {reconstruction.n_points} points"
         needed = f"{tracks.n_views} and {tracks.n_points}, as the tracks"
         raise ArgumentError("reconstruction", was, needed)
-    suffix = path.suffix.lower()
-    if suffix == ".npz" and not path.is_dir():
-        write_npz_scene(path, tracks, reconstruction)
-    elif suffix in _BAL and not path.is_dir():
-        cameras = _nine_numbers(tracks, reconstruction)
-        with writing(path) as file, compressing(file, suffix) as stream:
-            write_bal(stream, tracks, cameras, reconstruction.X)
-    else:
-        _write_folder(path, tracks, reconstruction, text, rigs)
+    suffix = "" if path.is_dir() else path.suffix.lower()
+    if suffix == ".npz":
+        return None
+    if suffix in _BAL:
+        return _nine_numbers(tracks, reconstruction)
+    return model_of(tracks, reconstruction, rigs)
+
+
+def is_scene(path: Path) -> bool:
+    """Tell whether a path is a scene with cameras of a known model and nothing else."""
+    return path.is_dir() or (path.suffix.lower() == ".npz" and is_npz_scene(path))
 
 
 def _listed() -> str:
@@ -169,10 +191,7 @@ def _read_folder(path: Path) -> ColmapModel:
     raise FileFormatError(path, "is no COLMAP model: it holds neither cameras.bin nor cameras.txt")
 
 
-def _write_folder(
-    path: Path, tracks: Tracks, reconstruction: MetricReconstruction, text: bool, rigs: str
-) -> None:
-    model = model_of(tracks, reconstruction, rigs)
+def _write_folder(path: Path, model: ColmapModel, text: bool) -> None:
     suffix, other = (".txt", ".bin") if text else (".bin", ".txt")
     stale = path / f"cameras{other}"
     if stale.exists():

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from epigauge import lm
 from epigauge._arguments import as_choice
+from epigauge.cameras import MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.adjust import bundle_adjust
 from epigauge.multi_view.initialize import initialize
@@ -96,7 +97,7 @@ class Comparison:
 def compare(
     tracks: Tracks,
     methods: str | Sequence[str] = "all",
-    start: Reconstruction | None = None,
+    start: Reconstruction | MetricReconstruction | None = None,
     *,
     on_method: Callable[[str], object] | None = None,
     **options: Any,
@@ -109,7 +110,7 @@ def compare(
         Observations.
     methods : "all" or sequence of str
         Names of strategies, see `bundle_adjust`.
-    start : Reconstruction, optional
+    start : Reconstruction or MetricReconstruction, optional
         Where all begin; by default `initialize(tracks)`.
     on_method : callable, optional
         Called with the name of each method before it runs; a true return value leaves out this

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.cameras import MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.gauge import normalized
 from epigauge.multi_view.plausible import camera_deviations, depth_signs, plausible_basis
@@ -76,13 +77,15 @@ class Display:
         return self.deviation > _DISTORTED
 
 
-def display(reconstruction: Reconstruction, tracks: Tracks, *, y_up: bool = False) -> Display:
+def display(
+    reconstruction: Reconstruction | MetricReconstruction, tracks: Tracks, *, y_up: bool = False
+) -> Display:
     """Choose a basis in which a reconstruction looks plausible and is not mirrored.
 
     Parameters
     ----------
-    reconstruction : Reconstruction
-        Cameras and points, in any basis.
+    reconstruction : Reconstruction or MetricReconstruction
+        Cameras and points, in any basis. A metric one keeps its shape.
     tracks : Tracks
         What they were made from.
     y_up : bool
@@ -108,6 +111,12 @@ def display(reconstruction: Reconstruction, tracks: Tracks, *, y_up: bool = Fals
     unit = float(np.sum(high - low))
     to_pixels = np.diag([unit, -unit if y_up else unit, 1.0])
     to_pixels[:2, 2] = (low + high) / 2.0
+    half = (high - low) / 2.0 / unit
+    box = half * [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+    if isinstance(reconstruction, MetricReconstruction):
+        seen = reconstruction.to_projective()
+        P, behind = np.linalg.solve(to_pixels, seen.P), ~(reconstruction.depths(tracks) > 0.0)
+        return _placed(np.asarray(P), seen.Q, tracks, behind, box, np.eye(4), y_up, 0.0)
     there = normalized().transformation(reconstruction.P, reconstruction.Q)
     P, Q = there.apply(np.asarray(np.linalg.solve(to_pixels, reconstruction.P)), reconstruction.Q)
     try:
@@ -117,15 +126,29 @@ def display(reconstruction: Reconstruction, tracks: Tracks, *, y_up: bool = Fals
             "reconstruction", "cannot be shown", "cameras of rank 3, points in different places"
         ) from None
     P, Q = P @ T, np.asarray(np.linalg.solve(T, Q.T).T)
-    signs = depth_signs(P, Q[tracks.point], tracks.view)
-    ahead = np.bincount(tracks.point, signs <= 0.0, minlength=len(Q)) == 0
+    behind = depth_signs(P, Q[tracks.point], tracks.view) <= 0.0
+    deviation = float(np.median(np.linalg.norm(camera_deviations(P), axis=0)))
+    return _placed(P, Q, tracks, behind, box, there.T @ T, y_up, deviation)
+
+
+def _placed(
+    P: Array,
+    Q: Array,
+    tracks: Tracks,
+    behind: NDArray[np.bool_],
+    box: Array,
+    T: Array,
+    y_up: bool,
+    deviation: float,
+) -> Display:
+    """Put cameras and points of a basis T upright about the middle of the points."""
+    ahead = np.bincount(tracks.point, behind, minlength=len(Q)) == 0
     upright = _upright(P, Q[ahead] if ahead.any() else Q)
     P, Q = P @ upright, np.asarray(np.linalg.solve(upright, Q.T).T)
     with np.errstate(divide="ignore", invalid="ignore"):
         points = Q[:, :3] / Q[:, 3:]
         near = np.linalg.norm(points, axis=1) < FAR_POINT
-    half = (high - low) / 2.0 / unit
-    centres, corners = _pyramids(P, half * [(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    centres, corners = _pyramids(P, box)
     distances = np.linalg.norm(centres, axis=1, keepdims=True)
     return Display(
         points=points,
@@ -133,8 +156,8 @@ def display(reconstruction: Reconstruction, tracks: Tracks, *, y_up: bool = Fals
         corners=corners,
         ahead=ahead,
         shown=ahead & near,
-        deviation=float(np.median(np.linalg.norm(camera_deviations(P), axis=0))),
-        T=there.T @ T @ upright,
+        deviation=deviation,
+        T=T @ upright,
         y_up=y_up,
     )
 

@@ -1,0 +1,236 @@
+"""What ``epigauge bundle`` and ``epigauge compare`` do with scenes of calibrated cameras."""
+
+from __future__ import annotations
+
+import errno
+import os
+import time
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.markup import escape
+
+import epigauge as eg
+from epigauge.cli._common import (
+    DONE,
+    INTERRUPTED,
+    NOT_CONVERGED,
+    console,
+    facts,
+    named,
+    shown,
+    write_json,
+)
+from epigauge.cli._live import watching
+from epigauge.errors import ArgumentError
+from epigauge.io import SceneSource, load_scene, plain, save_ply, save_scene
+from epigauge.io._npz_scene import write_npz_scene
+from epigauge.io.output import arrays_of_result
+from epigauge.io.scene_files import scene_content
+from epigauge.multi_view.display import Display, display
+
+_POINT, _CAMERA = (90, 140, 190), (224, 122, 31)
+
+Refine = Annotated[
+    str | None,
+    typer.Option(
+        help="Of a scene's cameras: all, pose, or names of parameters such as f,k1.",
+        show_default=False,
+    ),
+]
+FixView = Annotated[
+    list[str] | None,
+    typer.Option(help="Number (from 0) or name of a view of a scene that is not moved; several."),
+]
+Rigs = Annotated[
+    str, typer.Option(help="Poses of a COLMAP folder's rigs: keep (they must fit), or drop.")
+]
+
+
+def refuse_options(options: Mapping[str, Any]) -> None:
+    """Refuse what only projective cameras have, where it is given."""
+    for name, value in options.items():
+        if value is not None:
+            option = f"--{name.replace('_', '-')}"
+            raise ArgumentError(option, "is given with a scene", "tracks without cameras")
+
+
+def save_cloud(
+    path: Path,
+    points: NDArray[np.float64],
+    centres: NDArray[np.float64],
+    note: str,
+    colours: NDArray[np.uint8] | None = None,
+) -> None:
+    """Write points and centres of cameras as a cloud to look at."""
+    own = np.broadcast_to(np.array(_POINT, np.uint8), (len(points), 3))
+    cameras = np.broadcast_to(np.array(_CAMERA, np.uint8), (len(centres), 3))
+    rgb = np.vstack([own if colours is None else colours, cameras])
+    save_ply(path, np.vstack([points, centres]), rgb, note)
+
+
+class SceneJob:
+    """A scene, what is to be done with it, and the forms the answer is given in."""
+
+    def __init__(
+        self,
+        path: Path,
+        refine: str | None = None,
+        fixed: Sequence[str] = (),
+        rigs: str = "keep",
+        y_up: bool | None = None,
+    ) -> None:
+        self.path, self.rigs = path, rigs
+        self.tracks, self.start = load_scene(path)
+        self.refine: Any = refine or "all"
+        if self.refine not in ("all", "pose"):
+            self.refine = [name.strip() for name in self.refine.split(",")]
+        self.fixed = [self._view(name) for name in fixed]
+        self.y_up = self.start.cameras.model == "bal" if y_up is None else y_up
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was left out in reading."""
+        source = self.tracks.source
+        return source.notes if isinstance(source, SceneSource) else ()
+
+    def _view(self, name: str) -> int:
+        if name in (self.tracks.names or ()):
+            return (self.tracks.names or ()).index(name)
+        if name.isascii() and name.isdigit() and int(name) < self.tracks.n_views:
+            return int(name)
+        needed = f"a number from 0 to {self.tracks.n_views - 1}, or the name of a view"
+        raise ArgumentError("--fix-view", f"is {name!r:.60}", needed)
+
+    def run(
+        self, options: Mapping[str, Any], plots: Sequence[Path], outputs: Sequence[Path], json: bool
+    ) -> int:
+        """Adjust the scene and write what is asked for; return the exit code."""
+        for path in outputs:
+            self._check_target(path)
+        out = console()
+        begin = time.perf_counter()
+        with watching(out, len(self.tracks), "adjustment", not json) as watch:
+            watch.begin()
+            result = eg.bundle_adjust(
+                self.tracks,
+                self.start,
+                refine=self.refine,
+                fixed_views=self.fixed,
+                callback=watch,
+                **options,
+            )
+        answer = _SceneAnswer(self, result, time.perf_counter() - begin)
+        for path in outputs:
+            answer.save(path)
+        for path in plots:
+            answer.draw(path)
+        if json:
+            write_json(answer.document())
+        else:
+            for row in result.reconstruction.vectors:
+                typer.echo(" ".join(f"{value:.17g}" for value in row))
+            answer.report(out, watch.interrupted)
+        if watch.interrupted:
+            out.print(f"[bold red]interrupted[/] after {result.nfev} evaluations: this is the best")
+            return INTERRUPTED
+        return DONE if result.success else NOT_CONVERGED
+
+    def _check_target(self, path: Path) -> None:
+        """Check what a run that may be long will write, before it starts."""
+        if not path.parent.is_dir():
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
+        if path.suffix.lower() == ".ply":
+            return
+        content = scene_content(path, self.tracks, self.start, self.rigs)
+        rigs = getattr(content, "rigs", None) or ()
+        if any(len(rig.sensors) > 1 for rig in rigs):
+            was = "is 'keep', but views are adjusted one by one, so that rigs lose their poses"
+            raise ArgumentError("--rigs", was, "'drop', or an NPZ file to write to")
+
+
+class _SceneAnswer:
+    """An adjusted scene and the forms it is given in."""
+
+    def __init__(self, job: SceneJob, result: eg.BundleResult, seconds: float) -> None:
+        self.job, self.result, self.seconds = job, result, seconds
+
+    @cached_property
+    def frame(self) -> Display:
+        """Where to look at it."""
+        return display(self.result.reconstruction, self.job.tracks, y_up=self.job.y_up)
+
+    def more(self) -> dict[str, Any]:
+        """Return what neither result nor scene holds."""
+        tracks = self.job.tracks
+        return {
+            "source": str(self.job.path),
+            "n_views": tracks.n_views,
+            "n_points": tracks.n_points,
+            "seconds": self.seconds,
+        }
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        document: dict[str, Any] = plain(self.result)
+        scene = document.pop("reconstruction")
+        names = self.job.tracks.names
+        document |= scene.pop("cameras") | scene
+        return document | self.more() | {"names": plain(names), "notes": plain(self.job.notes)}
+
+    def save(self, path: Path) -> None:
+        """Write the scene with the result, or a cloud of points and centres."""
+        tracks, scene = self.job.tracks, self.result.reconstruction
+        match path.suffix.lower():
+            case ".ply":
+                note = "points, cameras orange"
+                save_cloud(path, scene.X, scene.centres, note, tracks.colours)
+            case ".npz":
+                more = arrays_of_result(self.result) | self.more()
+                write_npz_scene(path, tracks, scene, more)
+            case _:
+                save_scene(path, tracks, scene, rigs=self.job.rigs)
+
+    def draw(self, path: Path) -> None:
+        """Draw a picture, or write a page."""
+        tracks, title = self.job.tracks, named(self.job.path)
+        if path.suffix.lower() == ".html":
+            from epigauge.reports import save_viewer
+
+            save_viewer(path, self.result, tracks, title, frame=self.frame)
+            return
+        from epigauge.plots import plot_bundle, save_figure
+
+        save_figure(plot_bundle(self.result, tracks, title, frame=self.frame), path)
+
+    def report(self, out: Console, interrupted: bool) -> None:
+        """Tell people on stderr what came out."""
+        result, tracks, cameras = self.result, self.job.tracks, self.result.reconstruction.cameras
+        refine = self.job.refine
+        rows = {
+            "scene": f"{tracks.n_views} views, {tracks.n_points} points, "
+            f"{len(tracks)} observations",
+            "cameras": f"{len(cameras)} of the model {cameras.model}, refined: "
+            f"{refine if isinstance(refine, str) else 'pose, ' + ', '.join(refine)}",
+            "method": result.method,
+            "rms_px": f"{result.rms_px:.6g} per coordinate",
+            "cost": f"{result.cost:.8g} px^2",
+            "evaluations": f"{result.nfev}, with {result.njev} linearisations",
+            "status": "interrupted" if interrupted else escape(result.message),
+            "flags": escape(", ".join(result.flags)) or "none",
+            "seconds": f"{self.seconds:.2f}",
+        }
+        if result.loss_scale_px:
+            rows["loss_scale_px"] = f"{result.loss_scale_px:.4g}"
+        if self.job.notes:
+            rows["file"] = escape("; ".join(self.job.notes))
+        out.print(facts(escape(shown(self.job.path)), rows))
+        if not (result.success or interrupted):
+            why = result.message if result.status <= 0 or not result.flags else result.flags[0]
+            out.print(f"[bold red]not to be trusted:[/] {escape(why)}")
