@@ -8,6 +8,7 @@ import epigauge as eg
 import numpy as np
 import pytest
 from epigauge.errors import ArgumentError
+from metric_scenes import metric_scene
 
 
 def rows(n: int = 3, m: int = 8) -> dict[str, Any]:
@@ -284,6 +285,40 @@ def test_merged_tracks_cost_the_same_up_to_a_constant_whatever_is_predicted() ->
             for t in (tracks, merged)
         ]
         assert costs[0] == pytest.approx(costs[1] + constant, rel=1e-13)
+
+
+@pytest.mark.parametrize("metric", [False, True])
+def test_adjusting_second_sightings_is_least_squares_of_all_observations(metric: bool) -> None:
+    tracks, scene = metric_scene("SIMPLE_RADIAL", 4, noise_px=0.5, n_points=40)
+    rows = np.concatenate([np.arange(len(tracks)), [3, 3, 9, 30]])
+    xy = tracks.xy[rows] + np.random.default_rng(5).normal(0.0, 0.5, (len(rows), 2))
+    tracks = eg.Tracks(tracks.view[rows], tracks.point[rows], xy, repeated=True)
+    start = scene if metric else scene.to_projective()
+    costs: list[float] = []
+    options = {"ftol": 1e-14, "callback": lambda row: costs.append(row.cost)}
+    result = eg.bundle_adjust(tracks, start, **options)
+    assert (len(result.fun), len(result.rejected)) == (len(rows), len(rows))
+    assert costs == [row.cost for row in result.history]
+    assert min(costs) == pytest.approx(result.cost, rel=1e-12)
+    assert result.cost == pytest.approx(0.5 * np.sum(result.fun**2), rel=1e-12)
+    # Stationary by its points: J^T r of each vanishes, with every observation counted.
+    found = result.reconstruction
+    step = 1e-6
+    for axis in range(3):
+        if metric:
+            moved = found.X.copy()
+            moved[:, axis] += step
+            near = eg.MetricReconstruction(found.R, found.t, moved, found.cameras)
+        else:
+            moved = found.Q.copy()
+            moved[:, axis] += step
+            near = eg.Reconstruction(found.P, moved)
+        slope = (near.project(tracks) - found.project(tracks)) / step
+        along = np.bincount(tracks.point, np.sum(slope * result.fun, axis=1))
+        size = np.sqrt(np.bincount(tracks.point, np.sum(slope**2, axis=1)))
+        assert (np.abs(along) < 1e-3 * size).all()
+    with pytest.raises(eg.ArgumentError, match="robust"):
+        eg.bundle_adjust(tracks, start, loss="huber")
 
 
 def test_a_second_sighting_is_no_second_view() -> None:

@@ -21,6 +21,7 @@ from epigauge.multi_view.gauge import GAUGES, Gauge, five_points, identity, norm
 from epigauge.multi_view.initialize import Frame, initialize
 from epigauge.multi_view.problem import BundleProblem
 from epigauge.multi_view.rejection import without_gross_errors
+from epigauge.multi_view.repeated import merging_sightings
 from epigauge.multi_view.strategies import (
     STRATEGIES,
     ExplicitProblem,
@@ -101,6 +102,7 @@ class BundleResult:
     history: tuple[lm.Row, ...] = field(repr=False)
 
 
+@merging_sightings
 def bundle_adjust(
     tracks: Tracks,
     start: Reconstruction | MetricReconstruction | None = None,
