@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import epigauge as eg
 import numpy as np
 import pytest
 from epigauge import kernels
+from epigauge.bundle.freedom import Freedom
+from epigauge.bundle.linearizer import PointRefinement
+from epigauge.bundle.numpy_linearizer import NumpyLinearizer
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.problem import BundleProblem, BundleState, Estimate
+from epigauge.bundle.run import REFINEMENT, bundle_problem
+from epigauge.bundle.solve import BundleSystem, Step, System
+from epigauge.cameras import camera_model
+from epigauge.kernels import Table
 from epigauge.multi_view.gauge import Transformation
-from epigauge.multi_view.problem import BundleProblem, BundleState, Linearized
-from epigauge.multi_view.system import BundleSystem, Layout
 from epigauge.two_view.losses import Loss
 from numpy.typing import NDArray
 
@@ -106,19 +115,109 @@ def real_tracks(data_dir: Path, name: str) -> eg.Tracks:
 # ---------------------------------------------------------------- inside the solver
 
 
+@dataclass
+class Problem:
+    """The projective problem, with cameras (n, 3, 4) as the tests speak of them."""
+
+    kernels: Table
+    graph: ObservationGraph
+    q: Array
+    weights: Array
+    loss: Loss = field(default_factory=Loss)
+    embedded: bool = False
+    workers: int = 1
+    freedom: Freedom = field(default_factory=Freedom)
+
+    @property
+    def inner(self) -> BundleProblem:
+        """Return the problem that the solver minimises."""
+        return bundle_problem(
+            camera_model("projective"),
+            self.kernels,
+            self.graph,
+            self.q,
+            self.weights,
+            self.loss,
+            embedded=self.embedded,
+            workers=self.workers,
+            freedom=self.freedom,
+        )
+
+    def evaluate(self, estimate: tuple[Array, Array]) -> State:
+        """Return the state of cameras and points."""
+        P, Q = estimate
+        return State(P, Q, self.inner.evaluate(Estimate(P.reshape(-1, 12), Q)).cost, self)
+
+    def linearize(self, state: State) -> BundleSystem:
+        """Return the normal equations."""
+        return self.inner.linearize(state.inner)
+
+    def retract(self, state: State, step: Array | Step) -> tuple[Array, Array]:
+        """Return where a step leads, a vector of all own tangents or what a damping makes."""
+        if not isinstance(step, Step):
+            cameras, points = step[: state.P.size], step[state.P.size :]
+            step = Step(cameras.reshape(-1, 12), points.reshape(-1, 4), 0.0)
+        moved = self.inner.retract(state.inner, step)
+        return moved.cameras.reshape(-1, 3, 4), moved.points
+
+    def point_costs(self, P: Array, Q: Array) -> Array:
+        """Return the weighted robust sum of each point, (m,)."""
+        return self.inner.linearizer.point_costs(P.reshape(-1, 12), Q)
+
+    def triangulated(self, P: Array, Q: Array, how: PointRefinement = REFINEMENT) -> Array:
+        """Return the points after iterations of their own."""
+        return self.inner.linearizer.refine_points(P.reshape(-1, 12), Q, how)[0]
+
+
+@dataclass
+class State:
+    """Cameras and points with their cost."""
+
+    P: Array
+    Q: Array
+    cost: float
+    problem: Problem
+
+    @property
+    def inner(self) -> BundleState:
+        """Return the state that the solver knows."""
+        return BundleState(Estimate(self.P.reshape(-1, 12), self.Q), self.cost)
+
+    @property
+    def r(self) -> Array:
+        """Return the residuals q - q_hat, (2, N)."""
+        return self.problem.inner.linearizer.residuals(self.P.reshape(-1, 12), self.Q)
+
+    @property
+    def J_P(self) -> Array:
+        """Return the Jacobians of q_hat by the camera, (2, 12, N)."""
+        return self.reference.observe(self.P.reshape(-1, 12), self.Q)[1]
+
+    @property
+    def J_Q(self) -> Array:
+        """Return the Jacobians of q_hat by the point, (2, 4, N)."""
+        return self.reference.observe(self.P.reshape(-1, 12), self.Q)[2]
+
+    @property
+    def reference(self) -> NumpyLinearizer:
+        """Return the evaluation observation by observation."""
+        own = self.problem
+        parts = own.kernels, own.graph, own.q, own.weights, own.loss
+        return NumpyLinearizer(camera_model("projective"), *parts)
+
+    @property
+    def root(self) -> Array:
+        """Return the root of each observation's weight, that of the robust loss included, (N,)."""
+        return np.sqrt(self.reference.weights_at(self.r))
+
+
 def problem_of(
-    tracks: eg.Tracks,
-    *,
-    embedded: bool = False,
-    loss: Loss | None = None,
-    kind: type[BundleProblem] = BundleProblem,
-    scale: float = 1000.0,
-) -> BundleProblem:
+    tracks: eg.Tracks, *, embedded: bool = False, loss: Loss | None = None, scale: float = 1000.0
+) -> Problem:
     """Return the problem with image coordinates in units of `scale` pixels."""
-    layout = Layout(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+    graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
     q = np.ascontiguousarray(tracks.xy.T / scale)
-    weights = np.array(tracks.weights)
-    return kind(kernels.table(), layout, q, weights, loss or Loss(), embedded)
+    return Problem(kernels.table(), graph, q, np.array(tracks.weights), loss or Loss(), embedded)
 
 
 def in_units(reconstruction: eg.Reconstruction, scale: float = 1000.0) -> tuple[Array, Array]:
@@ -129,7 +228,7 @@ def in_units(reconstruction: eg.Reconstruction, scale: float = 1000.0) -> tuple[
 
 def small_system(
     n: int = 4, m: int = 20, *, seen: float = 0.7, seed: int = 0, noise_px: float = 3.0
-) -> tuple[BundleProblem, BundleState, Linearized]:
+) -> tuple[Problem, State, BundleSystem]:
     """Return a problem small enough for dense algebra, a state away from its minimum, and N, g."""
     truth = cameras_and_points(n, m, seed=seed)
     problem = problem_of(observed(truth, noise_px, seen=seen, seed=seed))
@@ -137,26 +236,40 @@ def small_system(
     return problem, state, problem.linearize(state)
 
 
-def dense(system: BundleSystem) -> Array:
-    """Return J^T J (and the border's B B^T) as one matrix."""
-    layout = system.layout
-    (n, a), (m, b) = system.g_cameras.shape, system.g_points.shape
-    N = np.zeros((n * a + m * b, n * a + m * b))
-    for i in range(n):
-        N[i * a : (i + 1) * a, i * a : (i + 1) * a] = system.U[i]
-    for j in range(m):
-        rows = slice(n * a + j * b, n * a + (j + 1) * b)
-        N[rows, rows] = system.V[j]
-    W = system.coupling.blocks()
-    for k, (i, j) in enumerate(zip(layout.view, layout.point, strict=True)):
-        rows, columns = slice(i * a, (i + 1) * a), slice(n * a + j * b, n * a + (j + 1) * b)
-        N[rows, columns] = W[k]
-        N[columns, rows] = W[k].T
-    if system.border is not None:
-        r = system.border[0].shape[2]
-        B = np.concatenate([part.reshape(-1, r) for part in system.border])
-        N += B @ B.T
+def whole_ties(system: System) -> Array:
+    """Return the matrix from all unknowns, x, s and y, to all own tangents."""
+    (n, d), (m, b) = system.normal.g_cameras.shape, system.normal.g_points.shape
+    ties = system.ties
+    A = np.broadcast_to(np.eye(d), (n, d, d)) if ties.A is None else ties.A
+    C = np.broadcast_to(np.eye(b), (m, b, b)) if ties.C is None else ties.C
+    local = block_diagonal((A, C))
+    count = n * A.shape[2]
+    shared = np.zeros((len(local), ties.n_shared))
+    if ties.E is not None:
+        for i in range(n):
+            for column, unknown in zip(ties.E[i].T, ties.index[i], strict=True):
+                shared[i * d : (i + 1) * d, unknown] += column
+    return np.hstack([local[:, :count], shared, local[:, count:]])
+
+
+def dense(system: System) -> Array:
+    """Return J^T J (and the constraints' B B^T) in the unknowns, with ones for frozen ones."""
+    (n, d), (m, b) = system.normal.g_cameras.shape, system.normal.g_points.shape
+    columns = []
+    for unit in np.eye(n * d + m * b):
+        parts = system.product(unit[: n * d].reshape(n, d), unit[n * d :].reshape(m, b))
+        columns.append(np.concatenate([part.ravel() for part in parts]))
+    B = whole_ties(system)
+    N = B.T @ np.array(columns).T @ B
+    frozen = np.flatnonzero(~B.any(axis=0))
+    N[frozen, frozen] = 1.0
     return N
+
+
+def matrix(damping: Any, system: BundleSystem) -> tuple[Array, Array]:
+    """Return the blocks of a damping's W, of cameras and of points."""
+    W = damping.blocks(system)
+    return W.cameras, W.points
 
 
 def block_diagonal(blocks: tuple[Array, Array]) -> Array:

@@ -54,6 +54,11 @@ class Table:
         for kernel, signature in SIGNATURES.items():
             setattr(self, kernel, wrap(kernel, signature))
 
+    @property
+    def compiled(self) -> bool:
+        """Tell whether the passes over observations of runtime/c belong to this back end."""
+        return self.name == "c"
+
     def __getattr__(self, kernel: str) -> Kernel:
         raise AttributeError(f"no kernel is named {kernel!r}; there are: {', '.join(SIGNATURES)}")
 

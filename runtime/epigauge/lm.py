@@ -228,7 +228,7 @@ class Outcome(Generic[S]):
     """Where a minimisation ended: state, linear system there, counts, reason and history.
 
     The compiled loop (`epigauge.two_view.native`) leaves no linear system behind, nor do the first
-    steps of a far start (`epigauge.multi_view.far`).
+    steps of a far start (`epigauge.bundle.far`).
     """
 
     state: S

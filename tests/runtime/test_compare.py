@@ -7,8 +7,8 @@ import dataclasses
 import epigauge as eg
 import numpy as np
 import pytest
+from epigauge.bundle.strategies import STRATEGIES
 from epigauge.errors import ArgumentError
-from epigauge.multi_view.strategies import STRATEGIES
 
 SCENE = eg.multi_view_scene(n_points=30, seed=1)
 START = eg.initialize(SCENE.tracks)

@@ -12,8 +12,8 @@ import epigauge as eg
 import many_views
 import numpy as np
 import pytest
+from epigauge.bundle.strategies import STRATEGIES
 from epigauge.errors import ArgumentError
-from epigauge.multi_view.strategies import STRATEGIES
 from laws import distance
 
 

@@ -11,9 +11,9 @@ import many_views
 import numpy as np
 import pytest
 from epigauge import kernels
+from epigauge.bundle.linearizer import PointRefinement
 from epigauge.errors import ArgumentError
-from epigauge.multi_view import problem as problem_module
-from epigauge.multi_view.initialize import Frame
+from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.resection import resect
 from epigauge.two_view.losses import Loss
 from laws import distance
@@ -185,12 +185,9 @@ def test_resection_finds_the_camera(wrong: int) -> None:
 @pytest.mark.parametrize("loss", ["linear", "cauchy"])
 @pytest.mark.parametrize("iterations", [1, 2, 5])
 def test_embedded_triangulation_never_raises_the_cost_of_a_point(
-    loss: str, iterations: int, monkeypatch: pytest.MonkeyPatch
+    loss: str, iterations: int
 ) -> None:
-    monkeypatch.setattr(
-        problem_module.BundleProblem, "triangulation", problem_module.Triangulation(iterations)
-    )
-    rejected = 0
+    how, rejected = PointRefinement(iterations), 0
     for seed in range(5):
         truth = many_views.cameras_and_points(4, 50, flatness=0.05, seed=seed)
         tracks = many_views.observed(truth, 2.0, seen=0.6, seed=seed)
@@ -200,10 +197,10 @@ def test_embedded_triangulation_never_raises_the_cost_of_a_point(
         # And from the optimum, where only rounding is left to gain.
         settled = near[0], near[1]
         for _ in range(10):
-            settled = near[0], problem.triangulated(*settled)
+            settled = near[0], problem.triangulated(*settled, how)
         for P, Q in (near, far, settled):
             before = problem.point_costs(P, Q)
-            moved = problem.triangulated(P, Q)
+            moved = problem.triangulated(P, Q, how)
             after = problem.point_costs(P, moved)
             assert (after <= before).all()
             if Q is settled[1]:
@@ -212,8 +209,8 @@ def test_embedded_triangulation_never_raises_the_cost_of_a_point(
                 assert after.sum() < 0.9 * before.sum()
         if loss == "linear" and iterations == 5:
             # Most of those that begin near are at their optimum then.
-            state = problem.evaluate((near[0], problem.triangulated(*near)))
-            gradient = problem.linearize(state).g_points
+            state = problem.evaluate((near[0], problem.triangulated(*near, how)))
+            gradient = problem.linearize(state).normal.g_points
             assert np.median(np.linalg.norm(gradient, axis=1)) < 1e-6
     assert rejected > 0
 

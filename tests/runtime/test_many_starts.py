@@ -12,11 +12,11 @@ import many_views
 import numpy as np
 import pytest
 from epigauge import kernels, lm
+from epigauge.bundle.far import FAR, JumpingProblem
+from epigauge.bundle.observations import ObservationGraph
 from epigauge.multi_view.factorization import FactorizationProblem, _OnCameras, _trust
-from epigauge.multi_view.far import FAR, JumpingProblem
+from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import normalized
-from epigauge.multi_view.initialize import Frame
-from epigauge.multi_view.system import Layout
 from laws import assert_jacobian, distance
 
 # The package has a function of the same name.
@@ -52,7 +52,7 @@ def perturbed(tracks: eg.Tracks, share: float, seed: int) -> eg.Reconstruction:
 
 def factorization(eta: float = 0.2, ridge: float = 0.3) -> tuple[FactorizationProblem, eg.Tracks]:
     tracks = many_views.observed(many_views.cameras_and_points(4, 15), seen=0.7)
-    layout = Layout(tracks.view, tracks.point, 4, 15)
+    layout = ObservationGraph(tracks.view, tracks.point, 4, 15)
     weights = np.random.default_rng(0).uniform(0.2, 2.0, len(tracks))
     q = Frame.of(tracks).conditioned(tracks)
     return FactorizationProblem(kernels.table(), layout, q, weights, eta, ridge), tracks
@@ -65,7 +65,7 @@ def test_gradient_of_the_factorization_is_that_of_the_cost_at_the_best_points(
     problem, _ = factorization(eta, ridge)
     P = np.random.default_rng(1).standard_normal((4, 3, 4))
     state = problem.evaluate(P)
-    found = problem.linearize(state).g_cameras.reshape(P.shape)
+    found = problem.linearize(state).normal.g_cameras.reshape(P.shape)
     scale = np.abs(found).max()
     assert_jacobian(lambda x: problem.evaluate(x).cost / scale, P, found / scale, tolerance=1e-8)
 
@@ -93,7 +93,7 @@ def test_steps_of_the_factorization_leave_the_points_undamped() -> None:
     N, lam = many_views.dense(system), 0.1
     damped = N + lam * np.diag(np.arange(len(N)) < 48)
     expected = -np.linalg.solve(damped, system.gradient)
-    assert distance(_OnCameras().step(system, lam), expected) < 1e-9
+    assert distance(np.asarray(_OnCameras().step(system, lam)), expected) < 1e-9
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -295,7 +295,8 @@ def test_points_jump_from_the_wrong_side_of_a_focal_plane() -> None:
     stuck = beyond
     for _ in range(10):
         stuck = problem.triangulated(P, stuck)
-    jumped = JumpingProblem(problem).triangulated(P, beyond)
+    problem.embedded = True
+    jumped = JumpingProblem.of(problem.inner).refined(P.reshape(-1, 12), beyond)[0]
     best = problem.point_costs(P, problem.triangulated(P, Q))
     assert problem.point_costs(P, stuck)[0] > 1e4 * best[0]
     assert problem.point_costs(P, jumped)[0] == pytest.approx(best[0], rel=1e-3)
@@ -304,13 +305,17 @@ def test_points_jump_from_the_wrong_side_of_a_focal_plane() -> None:
 def test_jumps_never_raise_the_cost_of_a_point() -> None:
     rng = np.random.default_rng(0)
     truth = many_views.cameras_and_points(4, 50)
-    problem = JumpingProblem(many_views.problem_of(many_views.observed(truth, seen=0.7)))
+    tracks = many_views.observed(truth, seen=0.7)
+    problem = JumpingProblem.of(many_views.problem_of(tracks, embedded=True).inner)
     P, _ = many_views.in_units(truth)
     for size in (0.01, 0.3):
         moved = P + size * rng.standard_normal(P.shape) / np.sqrt(12.0)
         points = rng.standard_normal((50, 4))
-        before = problem.point_costs(moved, points)
-        assert (problem.point_costs(moved, problem.triangulated(moved, points)) <= before).all()
+        rows = moved.reshape(-1, 12)
+        before = problem.linearizer.point_costs(rows, points)
+        refined, costs = problem.refined(rows, points)
+        assert (costs <= before).all()
+        assert distance(problem.linearizer.point_costs(rows, refined), costs) < 1e-9
 
 
 # ---------------------------------------------------------------- memory

@@ -9,8 +9,14 @@ import epigauge as eg
 import many_views
 import numpy as np
 import pytest
-from epigauge.multi_view.problem import BundleProblem
-from epigauge.multi_view.strategies import STRATEGIES, ExplicitProblem, RestrictedProblem, _factors
+from epigauge.bundle.problem import BundleProblem, Estimate
+from epigauge.bundle.strategies import (
+    STRATEGIES,
+    InGauge,
+    ReferenceOfProjective,
+    canonic_factors,
+)
+from epigauge.cameras import camera_model
 from laws import assert_jacobian, distance
 
 Array = many_views.Array
@@ -56,8 +62,8 @@ def recorded(
     estimates = []
     evaluate = BundleProblem.evaluate
 
-    def recording(self: BundleProblem, estimate: tuple[Array, Array]) -> Any:
-        estimates.append((estimate[0].copy(), estimate[1].copy()))
+    def recording(self: BundleProblem, estimate: Estimate) -> Any:
+        estimates.append((estimate.cameras.reshape(-1, 3, 4), estimate.points))
         return evaluate(self, estimate)
 
     with monkeypatch.context() as patch:
@@ -120,22 +126,22 @@ class TestFrozen:
             assert distance(np.linalg.norm(estimates[1][1], axis=1), np.ones(len(Q))) > 1e-9
 
 
-def restricted(kind: str, sigma: float | None = None) -> tuple[RestrictedProblem, Any]:
+def restricted(kind: str, sigma: float | None = None) -> tuple[many_views.Problem, Any]:
     truth = many_views.cameras_and_points(4, 20)
-    problem = many_views.problem_of(many_views.observed(truth, 3.0), kind=RestrictedProblem)
-    assert isinstance(problem, RestrictedProblem)
-    problem.reference, problem.points = kind, []
+    problem = many_views.problem_of(many_views.observed(truth, 3.0))
+    P, Q = many_views.in_units(many_views.shaken(truth))
+    chosen = eg.gauge.five_points.choose(Q)
     gauge: Any = {
         "camera": eg.gauge.reference_camera(),
         "cameras": eg.gauge.two_cameras(),
-        "points": eg.gauge.five_points(),
+        "points": eg.gauge.five_points(chosen),
     }[kind]
-    P, Q = many_views.in_units(many_views.shaken(truth))
-    if kind == "points":
-        problem.points = gauge.choose(Q)
+    problem.freedom = ReferenceOfProjective(
+        kernels=problem.kernels, reference=kind, chosen=tuple(chosen)
+    )
     P, Q = gauge.transformation(P, Q).apply(P, Q)
     if sigma is not None:
-        U, V, _ = _factors(P[1])
+        U, V, _ = canonic_factors(P[1])
         P[1] = problem.kernels.canonical_camera(U, V, np.array(sigma))
     return problem, problem.evaluate((P, Q))
 
@@ -144,9 +150,9 @@ def restricted(kind: str, sigma: float | None = None) -> tuple[RestrictedProblem
 def test_restricted_gradient_is_the_derivative_through_retract(kind: str) -> None:
     problem, state = restricted(kind)
     system = problem.linearize(state)
-    size = state.cost
+    size, own = state.cost, many_views.whole_ties(system)
     assert_jacobian(
-        lambda step: problem.evaluate(problem.retract(state, step)).cost / size,
+        lambda step: problem.evaluate(problem.retract(state, own @ step)).cost / size,
         np.zeros(system.gradient.size),
         system.gradient / size,
         step=1e-4,
@@ -160,7 +166,7 @@ def test_second_camera_is_factored_on_both_sides_of_sigma_one(sigma: float) -> N
     P, Q = problem.retract(state, np.zeros(state.P.size + state.Q.size))
     assert distance(P, state.P) < 1e-12
     np.testing.assert_array_equal(Q, state.Q)
-    assert float(_factors(state.P[1]).sigma) == pytest.approx(sigma, rel=1e-12)
+    assert float(canonic_factors(state.P[1]).sigma) == pytest.approx(sigma, rel=1e-12)
 
 
 @pytest.mark.parametrize("method", ["hartley", "bartoli", "faugeras", "mclauchlan"])
@@ -176,23 +182,26 @@ def test_other_dampings_serve_the_restricted_methods(
 
 def test_covariant_damping_of_a_restricted_problem_is_that_of_its_parameters() -> None:
     problem, state = restricted("cameras")
-    B = problem._bases(state)
-    full = BundleProblem.depth_blocks(problem, state)
-    for found, blocks, basis in zip(problem.depth_blocks(state), full, B, strict=True):
-        assert distance(found, basis.swapaxes(1, 2) @ blocks @ basis) < 1e-12
+    system = problem.linearize(state)
+    assert system.normal.depth_blocks is not None
+    bases = system.ties.A, system.ties.C
+    pairs = zip(system.depth_blocks, system.normal.depth_blocks, bases, strict=True)
+    for found, blocks, basis in pairs:
+        expected = basis.swapaxes(1, 2) @ blocks @ basis
+        free = np.einsum("ni,nj->nij", *[basis.any(axis=1)] * 2)
+        assert distance(found * free, expected) < 1e-12
 
 
-def test_explicit_problem_is_moved_every_so_often() -> None:
-    tracks = many_views.observed(many_views.cameras_and_points(4, 20))
-    problem = many_views.problem_of(tracks, kind=ExplicitProblem)
-    assert isinstance(problem, ExplicitProblem)
-    problem.gauge, problem.every = eg.gauge.normalized(), 3
+def test_an_estimate_is_moved_into_its_gauge_every_so_often() -> None:
     P, Q = many_views.in_units(many_views.cameras_and_points(4, 20))
-    state = problem.evaluate((P, Q))
-    step = 0.01 * np.random.default_rng(0).standard_normal(P.size + Q.size)
+    kept = InGauge(model=camera_model("projective"), gauge=eg.gauge.normalized(), every=3)
     normed = [
-        distance(np.linalg.norm(problem.retract(state, step)[1], axis=1), np.ones(20)) < 1e-12
-        for _ in range(6)
+        distance(
+            np.linalg.norm(kept.settled(2.0 * P.reshape(-1, 12), 2.0 * Q, steps)[1], axis=1),
+            np.ones(20),
+        )
+        < 1e-12
+        for steps in range(1, 7)
     ]
     assert normed == [False, False, True, False, False, True]
 

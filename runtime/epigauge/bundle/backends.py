@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.bundle.linearizer import Linearizer
+from epigauge.bundle.native_linearizer import NativeLinearizer
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.cameras import CameraModel
@@ -45,4 +46,6 @@ def linearizer_for(
     workers : int
         Threads to use where the back end can.
     """
+    if kernels.compiled:
+        return NativeLinearizer(model, graph, q, weights, loss, workers)
     return NumpyLinearizer(model, kernels, graph, q, weights, loss)

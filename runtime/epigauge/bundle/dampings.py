@@ -3,15 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.bundle.linearizer import point_damping
-from epigauge.bundle.solve import Blocks, Step, System
+from epigauge.bundle.moves import move_into
+from epigauge.bundle.null_space import minimum_norm_step
+from epigauge.bundle.solve import Blocks, BundleSystem, Step
+from epigauge.kernels import Table
+from epigauge.multi_view.gauge import Gauge
 
-__all__ = ["DAMPINGS", "ByMatrix", "Covariant", "Levenberg", "Marquardt"]
+__all__ = [
+    "DAMPINGS",
+    "ByMatrix",
+    "Covariant",
+    "GaugeInvariant",
+    "Implicit",
+    "Levenberg",
+    "Marquardt",
+    "PseudoInverse",
+]
 
 Array = NDArray[np.float64]
 
@@ -31,15 +45,15 @@ _SMALL = 1e-12
 class ByMatrix:
     """A damping that adds lambda W; W is block diagonal."""
 
-    def start(self, system: System) -> float:
+    def start(self, system: BundleSystem) -> float:
         """Return the first lambda."""
         return START
 
-    def blocks(self, system: System) -> Blocks:
+    def blocks(self, system: BundleSystem) -> Blocks:
         """Return the blocks of W in the unknowns."""
         raise NotImplementedError
 
-    def step(self, system: System, lam: float) -> Step:
+    def step(self, system: BundleSystem, lam: float) -> Step:
         """Return -(N + lambda W)^-1 g."""
         return system.damped_step(self.blocks(system), lam)
 
@@ -47,11 +61,11 @@ class ByMatrix:
 class Levenberg(ByMatrix):
     """W = I: invariant under orthonormal changes of basis only."""
 
-    def start(self, system: System) -> float:
+    def start(self, system: BundleSystem) -> float:
         """Return a fraction of the largest diagonal entry."""
         return START * system.largest()
 
-    def blocks(self, system: System) -> Blocks:
+    def blocks(self, system: BundleSystem) -> Blocks:
         """Return identities."""
         x, s, y = system.gradients
         return Blocks(_identities(x), np.ones(len(s)), _identities(y))
@@ -60,7 +74,7 @@ class Levenberg(ByMatrix):
 class Marquardt(ByMatrix):
     """W = diag(N): invariant under the scales of cameras and points only."""
 
-    def blocks(self, system: System) -> Blocks:
+    def blocks(self, system: BundleSystem) -> Blocks:
         """Return the diagonals."""
         shared = np.diagonal(system.U_shared)
         return Blocks(_diagonals(system.U), _positive(shared), _diagonals(system.V))
@@ -74,11 +88,11 @@ class Covariant(ByMatrix):
     each point's block. Affine: blockdiag(N).
     """
 
-    def start(self, system: System) -> float:
+    def start(self, system: BundleSystem) -> float:
         """Return the first lambda."""
         return START_METRIC if system.model.metric else START
 
-    def blocks(self, system: System) -> Blocks:
+    def blocks(self, system: BundleSystem) -> Blocks:
         """Return the blocks of W."""
         if system.model.homogeneous:
             cameras, points = system.depth_blocks
@@ -93,6 +107,103 @@ class Covariant(ByMatrix):
         diagonal = np.maximum(diagonal, _SMALL * diagonal.max(axis=0))
         cameras = np.where(diagonal > 0.0, diagonal, 1.0)[:, :, None] * np.eye(diagonal.shape[1])
         return Blocks(cameras, _positive(np.diagonal(system.U_shared)), points)
+
+
+@dataclass(frozen=True)
+class Implicit(ByMatrix):
+    """An inner damping as if in another gauge, without moving there (B03 eq. 9).
+
+    Parameters
+    ----------
+    inner : ByMatrix
+        The damping.
+    gauge : Gauge
+        Where it is to act.
+    """
+
+    inner: ByMatrix
+    gauge: Gauge
+
+    def start(self, system: BundleSystem) -> float:
+        """Return the inner damping's first lambda in the gauge."""
+        return self.inner.start(self._moved(system)[0])
+
+    def blocks(self, system: BundleSystem) -> Blocks:
+        """Return T~^T W T~, T~ from here to the gauge."""
+        moved, (cameras, points) = self._moved(system)
+        W = self.inner.blocks(moved)
+        return Blocks(
+            np.swapaxes(cameras, 1, 2) @ W.cameras @ cameras,
+            W.shared,
+            np.swapaxes(points, 1, 2) @ W.points @ points,
+        )
+
+    def _moved(self, system: BundleSystem) -> tuple[BundleSystem, tuple[Array, Array]]:
+        there = move_into(self.gauge, system.model, system.cameras, system.points)
+        sizes = len(system.cameras), len(system.points), system.model.tangent_size
+        return system.tied(*there.inverse().blocks(*sizes)), there.blocks(*sizes)
+
+
+@dataclass(frozen=True)
+class GaugeInvariant:
+    """Table 1 of B03; its W^-1 may be singular, so the step is taken in dual form.
+
+    delta = -R^T (R N R^T + lambda I)^-1 R g with R = diag(M_1, M_1, M_1, ..., S, ..., S), which
+    depends on R^T R only. Each block maximises sum |R g_k|^2 = <R^T R, G> over the gradients g_k,
+    G = sum g_k g_k^T, under a normalisation with b = 12 (cameras) or 4 (points).
+
+    Parameters
+    ----------
+    norm : {"product", "factor"}
+        What is normalised. "product": |R^T R|^2 = b as Table 1 prints, whose maximiser is
+        R^T R = sqrt(b) G / |G| (Cauchy-Schwarz). "factor": |vec R|^2 = b, for which the paper's
+        solution by a singular vector is right; R^T R = b v v^T of rank one, v the top eigenvector
+        of G: each camera moves in three directions, all points along one.
+    """
+
+    norm: str = "product"
+
+    def start(self, system: BundleSystem) -> float:
+        """Return a fraction of the largest diagonal entry."""
+        return START * system.largest()
+
+    def step(self, system: BundleSystem, lam: float) -> Step:
+        """Return the dual step."""
+        reduced = system.tied(*self.directions(system))
+        return reduced.damped_step(Levenberg().blocks(reduced), lam)
+
+    def directions(self, system: BundleSystem) -> tuple[Array, Array]:
+        """Return R^T: (n, 12, 3 k) and (m, 4, k), k = 4 for "product" and 1 for "factor"."""
+        of_cameras, _, of_points = system.gradients
+        rows = of_cameras.reshape(-1, 3, 4)
+        cameras = [np.kron(np.eye(3), self._block(g.T @ g, 12)) for g in rows]
+        points = self._block(of_points.T @ of_points, 4)
+        return np.stack(cameras), np.tile(points, (len(of_points), 1, 1))
+
+    def _block(self, gram: Array, b: int) -> Array:
+        values, vectors = np.linalg.eigh(gram)
+        if self.norm == "factor":
+            return np.asarray(np.sqrt(b) * vectors[:, 3:])
+        size = max(float(np.linalg.norm(values)), np.finfo(float).tiny)
+        return np.asarray(vectors * np.sqrt(np.sqrt(b) * np.maximum(values, 0.0) / size))
+
+
+@dataclass(frozen=True)
+class PseudoInverse:
+    """Minimum-norm Gauss-Newton steps by the known null space (FREE of B03); lambda shortens them.
+
+    A rejected step is retried with the length 1 / (1 + lambda).
+    """
+
+    kernels: Table
+
+    def start(self, system: BundleSystem) -> float:
+        """Return the first lambda: practically the full step."""
+        return START
+
+    def step(self, system: BundleSystem, lam: float) -> Step:
+        """Return -N^+ g / (1 + lambda)."""
+        return minimum_norm_step(system, self.kernels).shortened(system, 1.0 / (1.0 + lam))
 
 
 def _identities(gradient: Array) -> Array:
@@ -111,9 +222,12 @@ def _positive(diagonal: Array) -> Array:
     return np.where(diagonal > 0.0, diagonal, 1.0)
 
 
-#: The dampings by name.
-DAMPINGS: dict[str, Callable[[], Any]] = {
-    "levenberg": Levenberg,
-    "marquardt": Marquardt,
-    "covariant": Covariant,
+#: The dampings by name, made for the kernels of a back end.
+DAMPINGS: dict[str, Callable[[Table], Any]] = {
+    "levenberg": lambda _: Levenberg(),
+    "marquardt": lambda _: Marquardt(),
+    "covariant": lambda _: Covariant(),
+    "gauge_invariant": lambda _: GaugeInvariant(),
+    "gauge_invariant_factor": lambda _: GaugeInvariant("factor"),
+    "none": PseudoInverse,
 }

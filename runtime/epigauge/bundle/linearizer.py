@@ -145,6 +145,12 @@ class Linearizer(Protocol):
     def point_costs(self, cameras: Array, points: Array) -> Array:
         """Return the weighted robust sum of each point, (m,); not finite in a focal plane."""
 
+    def distances(self, cameras: Array, points: Array) -> Array:
+        """Return the distance of each observation to its projected point, (N,), in any order."""
+
+    def intersect(self, cameras: Array) -> Array:
+        """Return homogeneous points of least algebraic error, unit vectors (m, 4)."""
+
     def linearize(self, cameras: Array, points: Array) -> Normal:
         """Return the normal equations."""
 

@@ -147,6 +147,22 @@ class NativeLinearizer:
         self._each("bundle_costs", *map(address, (*estimate, costs)))
         return costs
 
+    def distances(self, cameras: Array, points: Array) -> Array:
+        """Return the distance of each observation to its projected point, (N,), in any order."""
+        if not self.factored:
+            with np.errstate(invalid="ignore", over="ignore"):
+                return np.asarray(np.linalg.norm(self.residuals(cameras, points), axis=0))
+        found, estimate = np.empty(len(self.graph.point)), self._estimate(cameras, points)
+        first = np.ascontiguousarray(self.graph.first)
+        self._each("bundle_distances", *map(address, (*estimate, first, found)))
+        return found
+
+    def intersect(self, cameras: Array) -> Array:
+        """Return homogeneous points of least algebraic error, unit vectors (m, 4)."""
+        points, inner = np.empty((self.graph.n_points, 4)), self._layout.inward(cameras)
+        self._each("bundle_intersect", address(inner), address(points))
+        return points
+
     def linearize(self, cameras: Array, points: Array) -> Normal:
         """Return the normal equations."""
         skyline = self.skyline  # the order of the cameras is settled from here on

@@ -14,7 +14,7 @@ from epigauge.cameras import CameraModel
 from epigauge.kernels import Table
 from epigauge.two_view.losses import Loss
 
-__all__ = ["NumpyLinearizer"]
+__all__ = ["NumpyLinearizer", "inverse_roots", "normal_equations"]
 
 Array = NDArray[np.float64]
 
@@ -23,6 +23,9 @@ _CHUNK = 4_000_000
 
 #: The reduced system of so many cameras is stored, dense; beyond, conjugate gradients.
 DENSE_CAMERAS = 300
+
+#: Places of the entries of a symmetric 4x4 matrix in its upper triangle, row by row.
+_SYMMETRIC = np.array([[0, 1, 2, 3], [1, 4, 5, 6], [2, 5, 7, 8], [3, 6, 8, 9]])
 
 _QUIET: dict[str, Any] = {"divide": "ignore", "invalid": "ignore", "over": "ignore"}
 
@@ -73,15 +76,27 @@ class NumpyLinearizer:
 
     def log_depths(self, cameras: Array, points: Array) -> tuple[Array, Array]:
         """Return Z = d log depth by camera (d, N) and point (b, N)."""
-        log_depth = self._kernel("log_depth")
+        P, Q = self._gathered(cameras, points)
         with np.errstate(**_QUIET):
-            Z_camera, Z_point = log_depth(*self._gathered(cameras, points))
+            Z_camera, Z_point = self.kernels.log_depth_derivatives(P.reshape(3, 4, -1), Q)
         return Z_camera, Z_point
 
     def point_costs(self, cameras: Array, points: Array) -> Array:
         """Return the weighted robust sum of each point, (m,); not finite in a focal plane."""
         with np.errstate(**_QUIET):
             return self._costs(self.residuals(cameras, points))[0]
+
+    def distances(self, cameras: Array, points: Array) -> Array:
+        """Return the distance of each observation to its projected point, (N,), in any order."""
+        with np.errstate(**_QUIET):
+            return np.asarray(np.linalg.norm(self.residuals(cameras, points), axis=0))
+
+    def intersect(self, cameras: Array) -> Array:
+        """Return homogeneous points of least algebraic error, unit vectors (m, 4)."""
+        P = cameras.reshape(-1, 3, 4).transpose(1, 2, 0)[:, :, self.graph.view]
+        upper = self.kernels.sight_normal(np.ascontiguousarray(P), self.q, np.ones(self.q.shape[1]))
+        gram = self.graph.sum_points(upper.T)[:, _SYMMETRIC]
+        return np.asarray(np.linalg.eigh(gram)[1][:, :, 0])
 
     def weights_at(self, r: Array) -> Array:
         """Return the weight of each squared residual, that of the robust loss included, (N,)."""
@@ -99,6 +114,12 @@ class NumpyLinearizer:
                 Z = self.log_depths(cameras, points)
                 blocks = self._sums(root * Z[0], root * Z[1])
             return normal_equations(self.graph, root * A, root * B, -root * r, blocks)
+
+    def coupling_blocks(self, cameras: Array, points: Array) -> Array:
+        """Return W = J_camera^T J_point of each observation, weighted, (N, d, b)."""
+        r, A, B = self.observe(cameras, points)
+        weight = self.weights_at(r)
+        return np.asarray(np.einsum("kin,kjn,n->nij", A, B, weight, optimize=True))
 
     def refine_points(
         self, cameras: Array, points: Array, how: PointRefinement
@@ -136,8 +157,7 @@ class NumpyLinearizer:
 
     def inverse_roots(self, V: Array, D: Array, lam: float, g: Array) -> tuple[Array, Array]:
         """Return T with T T^T = (V + lam D)^-1 for blocks (m, b, b), and T^T g."""
-        T = np.swapaxes(np.linalg.inv(np.linalg.cholesky(V + lam * D)), 1, 2)
-        return T, np.einsum("mij,mi->mj", T, g)
+        return inverse_roots(V, D, lam, g)
 
     def _costs(self, r: Array) -> tuple[Array, Array]:
         rho, first, _ = self.loss(np.sum(r**2, axis=0))
@@ -161,6 +181,12 @@ class NumpyLinearizer:
             np.ascontiguousarray(cameras.T[:, graph.view]),
             np.ascontiguousarray(points.T[:, graph.point]),
         )
+
+
+def inverse_roots(V: Array, D: Array, lam: float, g: Array) -> tuple[Array, Array]:
+    """Return T with T T^T = (V + lam D)^-1 for blocks (m, b, b), and T^T g."""
+    T = np.swapaxes(np.linalg.inv(np.linalg.cholesky(V + lam * D)), 1, 2)
+    return T, np.einsum("mij,mi->mj", T, g)
 
 
 def normal_equations(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from epigauge.bundle.freedom import Freedom
 from epigauge.bundle.linearizer import Linearizer, PointRefinement
 from epigauge.bundle.priors import Priors
-from epigauge.bundle.solve import Step, System
+from epigauge.bundle.solve import BundleSystem, Step
 from epigauge.cameras import MAX_FOCAL, MIN_FOCAL, CameraModel
 
 __all__ = ["BundleProblem", "BundleState", "Estimate"]
@@ -100,7 +100,7 @@ class BundleProblem:
         usable = math.isfinite(cost) and self._focal(estimate.cameras)
         return BundleState(estimate, cost if usable else float("inf"))
 
-    def linearize(self, state: BundleState) -> System:
+    def linearize(self, state: BundleState) -> BundleSystem:
         """Return the normal equations."""
         cameras, points = state.cameras, state.points
         normal = self.linearizer.linearize(cameras, points)
@@ -108,7 +108,15 @@ class BundleProblem:
             normal = self.priors.added(normal, cameras, points)
         normal, border = self.freedom.constrained(normal, cameras, points)
         ties = self.freedom.ties_at(cameras, points)
-        return System(self.model, self.linearizer, cameras, points, normal, ties, border)
+        return BundleSystem(
+            normal,
+            self.linearizer.inverse_roots,
+            ties,
+            border,
+            model=self.model,
+            cameras=cameras,
+            points=points,
+        )
 
     def retract(self, state: BundleState, step: Step) -> Estimate:
         """Return the estimate that a step leads to, its points re-triangulated where asked for."""

@@ -7,18 +7,27 @@ has blocks for pairs that see common points, and a border of the shared unknowns
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.bundle.linearizer import Linearizer, Normal, Pairs
+from epigauge.bundle.linearizer import Coupling, Normal, Pairs
 from epigauge.bundle.ties import Ties, congruent
 from epigauge.cameras import CameraModel
 
-__all__ = ["Blocks", "Border", "Step", "System"]
+__all__ = [
+    "Blocks",
+    "Border",
+    "Bordered",
+    "BundleSystem",
+    "Iterated",
+    "Step",
+    "System",
+    "reduced_system",
+]
 
 Array = NDArray[np.float64]
 
@@ -57,6 +66,15 @@ class Step:
     points: Array
     promised: float
 
+    def shortened(self, system: System, share: float) -> Step:
+        """Return a share of the step, with its own promise."""
+        cameras, points = share * self.cameras, share * self.points
+        slope = float(np.vdot(system.normal.g_cameras, cameras))
+        slope += float(np.vdot(system.normal.g_points, points))
+        # promised = -(slope + bend / 2), and the bend goes with the square of the share.
+        half_bend = -(self.promised + slope / share) * share**2
+        return Step(cameras, points, -(slope + half_bend))
+
     def __array__(self, dtype: Any = None, copy: Any = None) -> Array:
         """Return the step as one vector: cameras, then points."""
         return np.concatenate([self.cameras.ravel(), self.points.ravel()])
@@ -68,26 +86,19 @@ class System:
 
     Attributes
     ----------
-    model : CameraModel
-        The camera.
-    linearizer : Linearizer
-        What made the normal equations.
-    cameras, points : ndarray
-        Where: the estimate.
     normal : Normal
         In own tangents.
+    inverse_roots : callable
+        As `Linearizer.inverse_roots`.
     ties : Ties
         From the unknowns to own tangents.
     constraints : Border, optional
         A term B B^T beside J^T J.
     """
 
-    model: CameraModel
-    linearizer: Linearizer
-    cameras: Array
-    points: Array
     normal: Normal
-    ties: Ties
+    inverse_roots: Callable[[Array, Array, float, Array], tuple[Array, Array]]
+    ties: Ties = field(default_factory=Ties)
     constraints: Border | None = None
 
     @cached_property
@@ -149,7 +160,7 @@ class System:
         """Return the decrease that the quadratic model promises for a step."""
         return step.promised
 
-    def tied(self, B_cameras: Array, B_points: Array) -> System:
+    def tied(self, B_cameras: Array, B_points: Array) -> Self:
         """Return the system in other unknowns z with x = B_cameras z and y = B_points z."""
         return replace(self, ties=self.ties.then(B_cameras, B_points))
 
@@ -199,14 +210,15 @@ class System:
         columns = damped.ties.local(Bc), damped.ties.shared(Bc), self.ties.of_points(Bp)
         moved = damped.solve(*columns)
 
-        def along(*parts: Array) -> Array:
-            flat = [part.reshape(-1, part.shape[-1]) for part in columns]
-            pairs = zip(flat, parts, strict=True)
-            return sum((B.T @ part.reshape(len(B), -1) for B, part in pairs), np.zeros(()))
+        def along(x: Array, s: Array, y: Array) -> Array:
+            """Return B^T times columns, (k, l)."""
+            total = np.einsum("nak,nal->kl", columns[0], x) + np.einsum("rk,rl->kl", columns[1], s)
+            return np.asarray(total + np.einsum("mbk,mbl->kl", columns[2], y))
 
-        shift = np.linalg.solve(np.eye(Bc.shape[2]) + along(*moved), along(*free))[:, 0]
-        x, s, y = (part - move @ shift for part, move in zip(free, moved, strict=True))
-        return x, s, y
+        inner = np.eye(Bc.shape[2]) + along(*moved)
+        x, s, y = free
+        shift = np.linalg.solve(inner, along(x[..., None], s[:, None], y[..., None]))[:, 0]
+        return x - moved[0] @ shift, s - moved[1] @ shift, y - moved[2] @ shift
 
     def product(self, cameras: Array, points: Array) -> tuple[Array, Array]:
         """Return J^T J, and the constraints' term, times own tangents (n, d) and (m, b)."""
@@ -225,7 +237,7 @@ class System:
         Shape (n a + r, n a + r).
         """
         n, d, _ = self.normal.U.shape
-        S = -self.normal.coupling.schur(self._own(T), None)[0].dense()
+        S = -self.normal.coupling.schur(self.own_roots(T), None)[0].dense()
         S[np.arange(n), :, np.arange(n), :] += self.normal.U
         border = self.ties.border(n, d)
         A = np.broadcast_to(np.eye(d), (n, d, d)) if self.ties.A is None else self.ties.A
@@ -242,13 +254,30 @@ class System:
         whole[frozen, frozen] = 1.0
         return whole
 
-    def _own(self, T: Array) -> Array:
+    def own_roots(self, T: Array) -> Array:
         """Return roots (m, b, b) in own tangents, columns of zeros added where unknowns lack."""
         own = self.ties.points(T)
         lack = own.shape[1] - own.shape[2]
         if lack:
             own = np.concatenate([own, np.zeros((*own.shape[:2], lack))], axis=2)
         return np.ascontiguousarray(own)
+
+
+@dataclass(frozen=True)
+class BundleSystem(System):
+    """A system that knows where it was made.
+
+    Attributes
+    ----------
+    model : CameraModel
+        The camera.
+    cameras, points : ndarray, shape (n, c), (m, b)
+        The estimate.
+    """
+
+    model: CameraModel = field(kw_only=True)
+    cameras: Array = field(kw_only=True)
+    points: Array = field(kw_only=True)
 
 
 class _Damped:
@@ -258,20 +287,15 @@ class _Damped:
         self._system = system
         whitening = np.linalg.inv(np.swapaxes(np.linalg.cholesky(blocks.cameras), 1, 2))
         self.ties = system.ties.then(whitening, None).scaled(1.0 / np.sqrt(blocks.shared))
-        self._root, self._half = system.linearizer.inverse_roots(
+        self._root, self._half = system.inverse_roots(
             system.V, blocks.points, lam, system.gradients[2]
         )
-        self._T = system._own(self._root)
-        normal, coupling, half = system.normal, system.normal.coupling, self._wide(self._half)
-        white = congruent(self.ties.A, normal.U)
+        self._T = system.own_roots(self._root)
+        white = congruent(self.ties.A, system.normal.U)
         white = white + lam * np.eye(white.shape[1])
-        self._reduced: Bordered | Iterated
-        if coupling.direct:
-            pairs, self._right = coupling.schur(self._T, half)
-            self._reduced = Bordered(pairs, normal.U, self.ties, white, lam)
-        else:
-            self._right = coupling.to_cameras(self._T, half)
-            self._reduced = Iterated(normal, self.ties, self._T, white, lam)
+        self._reduced, self._right = reduced_system(
+            system.normal, self.ties, self._T, self._wide(self._half), white, lam
+        )
 
     def newton(self) -> tuple[Array, Array, Array]:
         """Return minus this times the gradient."""
@@ -302,6 +326,34 @@ class _Damped:
         """Return (m, b') with zeros where the points have fewer unknowns than coordinates."""
         lack = self._T.shape[2] - half.shape[1]
         return np.ascontiguousarray(np.pad(half, ((0, 0), (0, lack))) if lack else half)
+
+
+def reduced_system(
+    normal: Normal, ties: Ties, T: Array, half: Array | None, white: Array, lam: float
+) -> tuple[Bordered | Iterated, Array]:
+    """Return the reduced system of the views' unknowns, and W T half, (n, d).
+
+    Parameters
+    ----------
+    normal : Normal
+        In own tangents.
+    ties : Ties
+        From the unknowns.
+    T : ndarray, shape (m, b, b)
+        Inverse roots of the points' blocks, in own tangents.
+    half : ndarray, shape (m, b), or None
+        T^T times a right-hand side.
+    white : ndarray, shape (n, a, a)
+        Blocks of the views' own unknowns, lam I and all else included.
+    lam : float
+        Added to the diagonal of the shared ones.
+    """
+    coupling = normal.coupling
+    if coupling.direct:
+        pairs, right = coupling.schur(T, half)
+        return Bordered(pairs, normal.U, ties, white, lam), right
+    right = np.zeros(normal.g_cameras.shape) if half is None else coupling.to_cameras(T, half)
+    return Iterated(coupling, normal.U, ties, T, white, lam), right
 
 
 class Bordered:
@@ -335,13 +387,15 @@ class Bordered:
 class Iterated:
     """The reduced system by conjugate gradients, never formed; diagonal blocks precondition."""
 
-    def __init__(self, normal: Normal, ties: Ties, T: Array, white: Array, lam: float) -> None:
-        self._normal, self._ties, self._T, self._lam = normal, ties, T, lam
-        P = normal.coupling.diagonal(T)
+    def __init__(
+        self, coupling: Coupling, U: Array, ties: Ties, T: Array, white: Array, lam: float
+    ) -> None:
+        self._coupling, self._U, self._ties, self._T = coupling, U, ties, T
+        self._white, self._lam = white, lam
+        P = coupling.diagonal(T)
         less = P if ties.A is None else np.swapaxes(ties.A, 1, 2) @ P @ ties.A
         self._inverse = np.linalg.inv(white - less)
-        self._frozen = None if ties.A is None else ~ties.A.any(axis=1)
-        own = (normal.U - P) @ ties.border(*normal.U.shape[:2])
+        own = (U - P) @ ties.border(*U.shape[:2])
         self._inner = np.linalg.inv(ties.shared(own) + lam * np.eye(ties.n_shared))
 
     def solve(self, x: Array, s: Array) -> tuple[Array, Array]:
@@ -353,15 +407,8 @@ class Iterated:
         size = x.size
 
         def times(z: Array) -> Array:
-            own = self._ties.cameras(z[:size].reshape(*x.shape, 1), z[size:, None])[..., 0]
-            own = np.ascontiguousarray(own)
-            coupling = self._normal.coupling
-            less = coupling.to_cameras(self._T, coupling.to_points(self._T, own))
-            moved = (np.einsum("nij,nj->ni", self._normal.U, own) - less)[..., None]
-            local = self._ties.local(moved)[..., 0]
-            if self._frozen is not None:  # the block of a frozen unknown is one
-                local = local + np.where(self._frozen, z[:size].reshape(x.shape), 0.0)
-            return np.concatenate([local.ravel(), self._ties.shared(moved)[:, 0]]) + self._lam * z
+            local, shared = self._times(z[:size].reshape(x.shape), z[size:])
+            return np.concatenate([local.ravel(), shared])
 
         def precondition(z: Array) -> Array:
             local = np.einsum("nij,nj->ni", self._inverse, z[:size].reshape(x.shape))
@@ -369,6 +416,15 @@ class Iterated:
 
         found = conjugate_gradients(times, precondition, np.concatenate([x.ravel(), s]))
         return found[:size].reshape(x.shape), found[size:]
+
+    def _times(self, x: Array, s: Array) -> tuple[Array, Array]:
+        ties, T, coupling = self._ties, self._T, self._coupling
+        own = np.ascontiguousarray(ties.cameras(x[..., None], s[:, None])[..., 0])
+        less = coupling.to_cameras(T, coupling.to_points(T, own))[..., None]
+        of_shared = self._U @ ties.cameras(np.zeros((*x.shape, 1)), s[:, None])
+        local = np.einsum("nij,nj->ni", self._white, x) + ties.local(of_shared - less)[..., 0]
+        shared = ties.shared(self._U @ own[..., None] - less)[:, 0] + self._lam * s
+        return local, shared
 
 
 def conjugate_gradients(

@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 import epigauge as eg
+from epigauge.bundle.strategies import STRATEGIES
 from epigauge.cli._common import (
     DONE,
     INTERRUPTED,
@@ -36,7 +37,6 @@ from epigauge.cli.bundle import (
 from epigauge.io import TrackFile, load_track_file
 from epigauge.io.scene_files import is_scene
 from epigauge.multi_view.compare import Comparison
-from epigauge.multi_view.strategies import STRATEGIES
 
 
 def compare(

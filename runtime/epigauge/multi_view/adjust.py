@@ -12,25 +12,19 @@ from numpy.typing import NDArray
 
 from epigauge import kernels, lm
 from epigauge._arguments import as_choice, as_count, as_positive
-from epigauge.bundle.metric import adjust_metric
+from epigauge.bundle.dampings import DAMPINGS
+from epigauge.bundle.jobs import metric_job, projective_job
+from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.priors import Prior
+from epigauge.bundle.run import checked_gauge, minimized
+from epigauge.bundle.strategies import STRATEGIES
 from epigauge.cameras import MetricReconstruction
-from epigauge.errors import ArgumentError
-from epigauge.multi_view import dampings, far
-from epigauge.multi_view.gauge import GAUGES, Gauge, five_points, identity, normalized
-from epigauge.multi_view.initialize import Frame, initialize
-from epigauge.multi_view.problem import BundleProblem
+from epigauge.multi_view.gauge import Gauge
+from epigauge.multi_view.initialize import initialize
 from epigauge.multi_view.rejection import without_gross_errors
 from epigauge.multi_view.repeated import merging_sightings
-from epigauge.multi_view.strategies import (
-    STRATEGIES,
-    ExplicitProblem,
-    RestrictedProblem,
-    Strategy,
-)
-from epigauge.multi_view.system import Layout
 from epigauge.multi_view.tracks import Reconstruction, Tracks
-from epigauge.multi_view.verdicts import Verdict, judged
+from epigauge.multi_view.verdicts import Verdict, judged, judged_metric
 from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
 from epigauge.verdicts import FLAGS, usable
 
@@ -38,14 +32,6 @@ __all__ = ["BundleResult", "bundle_adjust"]
 
 Array = NDArray[np.float64]
 
-_DAMPINGS: dict[str, Callable[[], Any]] = {
-    "levenberg": dampings.Levenberg,
-    "marquardt": dampings.Marquardt,
-    "covariant": dampings.Covariant,
-    "gauge_invariant": dampings.GaugeInvariant,
-    "gauge_invariant_factor": lambda: dampings.GaugeInvariant("factor"),
-    "none": dampings.PseudoInverse,
-}
 _SCHEDULES: dict[str, Callable[[], lm.Schedule]] = {"classic": lm.Classic, "nielsen": lm.Nielsen}
 
 
@@ -246,109 +232,52 @@ def bundle_adjust(
         start = initialize(tracks, robust=True, backend=backend) if start is None else start
         last = as_choice("loss", loss, LOSSES), loss_scale_px
         return without_gross_errors(partial(bundle_adjust, **options), tracks, start, table, last)
-    strategy = STRATEGIES[as_choice("method", method, STRATEGIES)]
+    as_choice("method", method, STRATEGIES)
     as_choice("gauge_mode", gauge_mode, ("explicit", "implicit"))
     as_choice("schedule", schedule, _SCHEDULES)
     as_choice("loss", loss, LOSSES)
     if damping is not None:
-        as_choice("damping", damping, _DAMPINGS)
-    if gauge is not None and (strategy.gauge is not None or strategy.reference):
-        raise ArgumentError("gauge", f"is given with method={method!r}", "a method without its own")
-    if isinstance(gauge, type) and issubclass(gauge, GAUGES):
-        gauge = gauge()
-    if gauge is not None and (isinstance(gauge, type) or not hasattr(gauge, "transformation")):
-        raise ArgumentError("gauge", f"is {gauge!r}", "a gauge, such as eg.gauge.normalized()")
-    act: Any = strategy.damping() if damping is None else _DAMPINGS[damping]()
-    if not isinstance(act, dampings.ByMatrix):
-        # Such a step is made for all parameters, free and unconstrained.
-        if strategy.reference or strategy.constrained:
-            raise ArgumentError(
-                "damping", f"is {damping!r} with method={method!r}", "one that adds a matrix"
-            )
-        if gauge is not None and gauge_mode == "implicit":
-            raise ArgumentError(
-                "gauge_mode", "is 'implicit' with a damping that adds no matrix", "'explicit'"
-            )
+        as_choice("damping", damping, DAMPINGS)
+    gauge = checked_gauge(gauge, method)
     workers = as_count("workers", workers)
     stopping = lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter)
-    if isinstance(start, MetricReconstruction):
-        scale_px = _loss_scale(loss, loss_scale_px, tracks, start)
-        found = adjust_metric(
-            tracks,
-            start,
-            refine=refine,
-            fixed_views=fixed_views,
-            fixed_points=fixed_points,
-            priors=priors,
-            method=method,
-            damping=damping,
-            embedded=embedded,
-            schedule=_SCHEDULES[schedule](),
-            loss=Loss(loss, scale_px),
-            stopping=stopping,
-            workers=workers,
-            backend=backend,
-            callback=callback,
-        )
-        rejected = np.zeros(len(tracks), dtype=np.bool_)
-        metric = found.reconstruction, found.outcome, 1.0, found.verdict
-        return _result(tracks, *metric, rejected, method, scale_px)
-    _check_projective(refine, fixed_views, fixed_points, priors)
     table = kernels.table(backend)
-    if start is None:
-        start = initialize(tracks, backend=backend)
-    if len(start.P) != tracks.n_views or len(start.Q) != tracks.n_points:
-        raise ArgumentError(
-            "start",
-            f"has {len(start.P)} cameras and {len(start.Q)} points",
-            f"{tracks.n_views} and {tracks.n_points}, as the tracks",
-        )
-    frame = Frame.of(tracks)
-    layout = Layout(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+    of_metric: dict[str, Any] = {
+        "refine": refine,
+        "fixed_views": fixed_views,
+        "fixed_points": fixed_points,
+        "priors": priors,
+    }
+    if isinstance(start, MetricReconstruction):
+        job = metric_job(tracks, start, **of_metric)
+    else:
+        start = initialize(tracks, backend=backend) if start is None else start
+        job = projective_job(tracks, start, **of_metric)
     scale_px = _loss_scale(loss, loss_scale_px, tracks, start)
-    parts = (
-        table,
-        layout,
-        _measured(tracks, frame, start),
+    outcome, cameras, points = minimized(
+        job,
+        ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points),
         np.asarray(tracks.weights),
-        Loss(loss, scale_px / frame.scale),
-        embedded and strategy.embedded and damping in (None, "covariant"),
-        workers,
+        table,
+        method=method,
+        gauge=gauge,
+        gauge_mode=gauge_mode,
+        damping=damping,
+        embedded=embedded,
+        schedule=_SCHEDULES[schedule],
+        loss=Loss(loss, scale_px / job.scale_px),
+        stopping=stopping,
+        workers=workers,
+        callback=callback,
     )
-    explicit = strategy.gauge if strategy.explicit else gauge
-    if gauge is not None and gauge_mode == "implicit":
-        act, explicit = dampings.Implicit(act, gauge), None
-    # The best conditioned basis, where the method does not mind and the caller does not ask.
-    home = normalized() if isinstance(act, dampings.Covariant) and gauge is None else identity()
-    first = strategy.gauge or explicit or home
-
-    def minimized(P: Array, Q: Array) -> tuple[lm.Outcome[Any], Array, Array]:
-        there = first.transformation(P, Q)
-        problem = _problem(strategy, explicit, parts, Q)
-        # Points jump alike whatever the basis, but only in the one chosen here: in no gauge.
-        minimize = far.minimize if problem.embedded and gauge is None else lm.minimize
-        begun, how = there.apply(P, Q), _SCHEDULES[schedule]()
-        unit = frame.scale**2
-        outcome = minimize(problem, begun, act, how, stopping, callback, unit)
-        P, Q = outcome.state.P, outcome.state.Q
-        return (outcome, *(there.inverse().apply(P, Q) if first is home else (P, Q)))
-
-    try:
-        outcome, P, Q = far.minimized_from(minimized, frame.cameras_in(start.P), start.Q)
-    except np.linalg.LinAlgError:
-        raise ArgumentError(
-            "start",
-            f"leaves the steps of method={method!r} undetermined (singular normal equations), and "
-            "so does one a thousandth away",
-            "cameras with different centres, points away from them and not in one plane, or "
-            "method='covariant'",
-        ) from None
-    reconstruction = Reconstruction(frame.cameras_out(P), Q)
+    reconstruction = job.result(cameras, points)
     rejected = np.zeros(len(tracks), dtype=np.bool_)
-    verdict = judged(tracks, reconstruction, rejected, loss == "linear", table, workers)
-    return _result(
-        tracks, reconstruction, outcome, frame.scale**2, verdict, rejected, method, scale_px
-    )
+    if isinstance(reconstruction, MetricReconstruction):
+        verdict = judged_metric(tracks, reconstruction, outcome)
+    else:
+        verdict = judged(tracks, reconstruction, rejected, loss == "linear", table, workers)
+    unit = job.scale_px**2
+    return _result(tracks, reconstruction, outcome, unit, verdict, rejected, method, scale_px)
 
 
 def _result(
@@ -389,49 +318,6 @@ def _message(status: int, flags: tuple[str, ...]) -> str:
     spoiling = [name for name in flags if not usable([name], "views")]
     reasons = [f"{name}: {FLAGS[name].sentence}" for name in spoiling]
     return "; but ".join([lm.STATUS[status], *reasons])
-
-
-def _check_projective(refine: Any, *others: Any) -> None:
-    """Refuse what a projective start has no use for."""
-    names = ("fixed_views", "fixed_points", "priors")
-    for name, value in zip(names, others, strict=True):
-        if value is not None and len(list(value)):
-            raise ArgumentError(name, "is given with a projective start", "a metric start")
-    if not (isinstance(refine, str) and refine == "all"):
-        raise ArgumentError(
-            "refine", f"is {refine!r:.60} with a projective start", "a metric start"
-        )
-
-
-def _measured(tracks: Tracks, frame: Frame, start: Reconstruction) -> Array:
-    """Return the conditioned observations, shape (2, N).
-
-    Those of weight zero are put where the start has them: the least weight that keeps the equations
-    regular (`engine.LEAST_WEIGHT`) must not draw towards anything, however wrong.
-    """
-    q = frame.conditioned(tracks)
-    off = tracks.weights == 0.0
-    if off.any():
-        predicted = frame.points_in(start.project(tracks), tracks.view)[:, off]
-        q[:, off] = np.where(np.isfinite(predicted), predicted, 0.0)
-    return q
-
-
-def _problem(
-    strategy: Strategy, explicit: Gauge | None, parts: tuple[Any, ...], Q: Array
-) -> BundleProblem:
-    """Return the problem with its frozen parameters or its gauge."""
-    if strategy.reference:
-        restricted = RestrictedProblem(*parts)
-        restricted.reference = strategy.reference
-        restricted.points = five_points.choose(Q) if strategy.reference == "points" else []
-        return restricted
-    if explicit is not None:
-        moved = ExplicitProblem(*parts)
-        moved.gauge, moved.every = explicit, strategy.every
-        moved.constrained = strategy.constrained
-        return moved
-    return BundleProblem(*parts)
 
 
 def _loss_scale(

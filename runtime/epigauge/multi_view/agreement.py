@@ -10,10 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.bundle.backends import linearizer_for
+from epigauge.bundle.linearizer import PointRefinement
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.cameras import camera_model
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
-from epigauge.multi_view.problem import BundleProblem
-from epigauge.multi_view.system import Layout
 from epigauge.scatter import spread
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.consensus import Consensus
@@ -120,13 +122,25 @@ def _least_algebraic(sums: Array) -> Array:
     return np.asarray(np.linalg.eigh(N)[1][:, :, 0].reshape(-1, 3, 4))
 
 
-def agreed_points(problem: BundleProblem, P: Array, Q: Array, scale: float) -> Array:
+def agreed_points(
+    kernels: Table,
+    graph: ObservationGraph,
+    q: Array,
+    weights: Array,
+    P: Array,
+    Q: Array,
+    scale: float,
+) -> Array:
     """Return points, each where a pair of its lines of sight meets if that suits the others more.
 
     Parameters
     ----------
-    problem : BundleProblem
-        The observations.
+    kernels : Table
+        Back end.
+    graph : ObservationGraph
+        Which observation belongs to what.
+    q, weights : ndarray, shape (2, N), (N,)
+        Measurements, and factor of each squared residual.
     P, Q : ndarray, shape (n, 3, 4), (m, 4)
         Cameras, and points to begin from.
     scale : float
@@ -137,32 +151,28 @@ def agreed_points(problem: BundleProblem, P: Array, Q: Array, scale: float) -> A
     ndarray, shape (m, 4)
         Points of least Cauchy loss among those proposed, refined.
     """
-    judge = BundleProblem(
-        problem.kernels,
-        problem.layout,
-        problem.q,
-        problem.weights,
-        Loss("cauchy", scale),
-        workers=problem.workers,
-    )
-    layout, rng = problem.layout, np.random.default_rng(0)
-    first, lengths = layout.first[:-1], np.diff(layout.first)
-    best, least = Q, _finite(judge.point_costs(P, Q))
+    model, cameras = camera_model("projective"), P.reshape(-1, 12)
+    judge = linearizer_for(model, kernels, graph, q, weights, Loss("cauchy", scale))
+    rng = np.random.default_rng(0)
+    first, lengths = graph.first[:-1], np.diff(graph.first)
+    best, least = Q, _finite(judge.point_costs(cameras, Q))
     for k in range(-1, _PAIRS):
         if k < 0:
-            proposed = judge.engine.intersected(P)
+            proposed = judge.intersect(cameras)
         else:
             one = rng.integers(0, lengths)
             two = (one + rng.integers(1, np.maximum(lengths, 2))) % lengths
             rows = np.sort(np.column_stack([first + one, first + two]), axis=1).ravel()
-            alone = Layout(layout.view[rows], layout.point[rows], layout.n_views, layout.n_points)
-            q = np.ascontiguousarray(problem.q[:, rows])
-            pair = BundleProblem(problem.kernels, alone, q, np.ones(len(rows)), Loss())
-            proposed = pair.engine.intersected(P)
-        costs = _finite(judge.point_costs(P, proposed))
+            alone = ObservationGraph(
+                graph.view[rows], graph.point[rows], graph.n_views, graph.n_points
+            )
+            measured = np.ascontiguousarray(q[:, rows]), np.ones(len(rows))
+            pair = linearizer_for(model, kernels, alone, *measured, Loss())
+            proposed = pair.intersect(cameras)
+        costs = _finite(judge.point_costs(cameras, proposed))
         better = costs < least
         best, least = np.where(better[:, None], proposed, best), np.where(better, costs, least)
-    return judge.triangulated(P, np.ascontiguousarray(best))
+    return judge.refine_points(cameras, np.ascontiguousarray(best), PointRefinement())[0]
 
 
 def _finite(costs: Array) -> Array:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from epigauge import lm
 from epigauge._arguments import as_choice
+from epigauge.bundle.strategies import STRATEGIES
 from epigauge.cameras import MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.adjust import bundle_adjust
 from epigauge.multi_view.initialize import initialize
-from epigauge.multi_view.strategies import STRATEGIES
 from epigauge.multi_view.tracks import Reconstruction, Tracks
 
 if TYPE_CHECKING:

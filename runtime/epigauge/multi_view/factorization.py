@@ -7,17 +7,17 @@ first stage, nearly affine and with a ridge, leads from random cameras to where 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import lm
+from epigauge.bundle.numpy_linearizer import inverse_roots, normal_equations
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.solve import Blocks, Step, System
 from epigauge.kernels import Table
-from epigauge.multi_view.dampings import ByMatrix
-from epigauge.multi_view.engine import normal_equations
-from epigauge.multi_view.system import BundleSystem, Layout
 from epigauge.two_view.losses import robust_scale
 
 __all__ = ["FactorizationProblem", "FactorizationState", "factorized", "typical_block"]
@@ -69,7 +69,7 @@ class FactorizationProblem:
     ----------
     kernels : Table
         Backend.
-    layout : Layout
+    layout : ObservationGraph
         Which observation belongs to what.
     q : ndarray, shape (2, N)
         Measurements in coordinates of RMS one.
@@ -84,7 +84,13 @@ class FactorizationProblem:
     floor = 0.0
 
     def __init__(
-        self, kernels: Table, layout: Layout, q: Array, weights: Array, eta: float, ridge: float
+        self,
+        kernels: Table,
+        layout: ObservationGraph,
+        q: Array,
+        weights: Array,
+        eta: float,
+        ridge: float,
     ) -> None:
         self.kernels, self.layout, self.q = kernels, layout, q
         self.root, self.eta, self.ridge = np.sqrt(weights), np.array(eta), ridge
@@ -105,22 +111,22 @@ class FactorizationProblem:
         cost = 0.5 * float(np.sum(r**2) + self.ridge * squared)
         return FactorizationState(P, X, cost if np.isfinite(cost) else float("inf"))
 
-    def linearize(self, state: FactorizationState) -> BundleSystem:
+    def linearize(self, state: FactorizationState) -> System:
         """Return the normal equations; the points, at their best, have no gradient."""
         r, J_P, J_X = self._residuals(state.P, state.X)
         normal = normal_equations(self.layout, J_P, J_X, r)
-        return BundleSystem(
-            self.layout,
+        held = replace(
+            normal,
             U=normal.U + self.ridge * np.diag(self.held),
             V=normal.V + self.ridge * np.eye(3),
-            W=normal.coupling,
             g_cameras=normal.g_cameras + self.ridge * self.held * state.P.reshape(-1, 12),
             g_points=np.zeros_like(state.X),
         )
+        return System(held, inverse_roots)
 
-    def retract(self, state: FactorizationState, step: Array) -> Array:
+    def retract(self, state: FactorizationState, step: Step) -> Array:
         """Return the cameras that a step leads to; their points are found anew."""
-        return np.asarray(state.P + step[: state.P.size].reshape(state.P.shape))
+        return np.asarray(state.P + step.cameras.reshape(state.P.shape))
 
     def distances(self, state: FactorizationState) -> Array:
         """Return the length of each observation's residual, without its weight, (N,)."""
@@ -147,20 +153,20 @@ class FactorizationState:
     cost: float
 
 
-class _OnCameras(ByMatrix):
+class _OnCameras:
     """lambda I on the cameras only: with exact points, this is variable projection (RW2)."""
 
-    def start(self, system: BundleSystem) -> float:
+    def start(self, system: System) -> float:
         """Return a small fraction of the largest diagonal entry."""
         return _FIRST * system.largest()
 
-    def matrix(self, system: BundleSystem) -> tuple[Array, Array]:
-        """Return identities and zeros."""
-        n, a = system.g_cameras.shape
-        return np.broadcast_to(np.eye(a), (n, a, a)), np.zeros_like(system.V)
+    def step(self, system: System, lam: float) -> Step:
+        """Return the step damped by identities and zeros."""
+        blocks = np.broadcast_to(np.eye(system.U.shape[1]), system.U.shape)
+        return system.damped_step(Blocks(blocks, np.ones(0), np.zeros_like(system.V)), lam)
 
 
-def typical_block(layout: Layout) -> float:
+def typical_block(layout: ObservationGraph) -> float:
     """Return the typical size of a point's block of the normal matrix, for points of their own.
 
     The singular values of the matrix of projections, in coordinates of RMS one, are about the root
@@ -172,7 +178,7 @@ def typical_block(layout: Layout) -> float:
 
 
 def factorized(
-    kernels: Table, layout: Layout, q: Array, weights: Array, *, seed: int, robust: bool
+    kernels: Table, layout: ObservationGraph, q: Array, weights: Array, *, seed: int, robust: bool
 ) -> tuple[Array, Array]:
     """Reconstruct from random affine cameras.
 
@@ -180,7 +186,7 @@ def factorized(
     ----------
     kernels : Table
         Backend.
-    layout : Layout
+    layout : ObservationGraph
         Which observation belongs to what.
     q : ndarray, shape (2, N)
         Measurements in coordinates of RMS one, centred.

@@ -10,13 +10,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Protocol
+from typing import Protocol, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
 from epigauge._arguments import as_real
+from epigauge.bundle.similarity import Similarity
+from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.tracks import Reconstruction
 from epigauge.scatter import spreading_basis
@@ -24,12 +26,16 @@ from epigauge.scatter import spreading_basis
 __all__ = [
     "GAUGES",
     "Gauge",
+    "Group",
+    "Similarity",
     "Transformation",
     "equivalent",
     "five_points",
+    "group",
     "identity",
     "normalized",
     "reference_camera",
+    "similarity",
     "transform",
     "two_cameras",
 ]
@@ -117,33 +123,188 @@ class Gauge(Protocol):
         """
 
 
+@dataclass(frozen=True)
+class Group:
+    """The gauge group of a camera model: what moves cameras and points and changes no image.
+
+    Attributes
+    ----------
+    model : str
+        Name of the camera model.
+    dimension : int
+        Of the group, beside the scales of homogeneous cameras and points.
+    names : tuple of str
+        What its generators are.
+    """
+
+    model: str
+    dimension: int
+    names: tuple[str, ...]
+
+    def generators(
+        self, reconstruction: Reconstruction | MetricReconstruction
+    ) -> tuple[Array, Array]:
+        """Return the velocities of cameras and points along the group.
+
+        Parameters
+        ----------
+        reconstruction : Reconstruction or MetricReconstruction
+            Where, with cameras of this model.
+
+        Returns
+        -------
+        cameras, points : ndarray, shape (n, d, dimension), (m, b, dimension)
+            In each camera's own tangent (turn and move in its own frame, intrinsics; all entries of
+            a projective one) and in the coordinates of each point. The Jacobian of the images times
+            them is zero.
+
+        Raises
+        ------
+        ArgumentError
+            If the reconstruction has other cameras.
+        """
+        model = camera_model(self.model)
+        if isinstance(reconstruction, MetricReconstruction):
+            name, rows, points = (
+                reconstruction.cameras.model,
+                reconstruction.vectors,
+                reconstruction.X,
+            )
+        else:
+            name, rows, points = "projective", reconstruction.P.reshape(-1, 12), reconstruction.Q
+        if name != model.name:
+            raise ArgumentError("reconstruction", f"has {name} cameras", f"{model.name} cameras")
+        of_cameras, of_points = (
+            model.kernel(f"{what}_generators")(array.T)
+            for what, array in (("camera", rows), ("point", points))
+        )
+        return of_cameras.transpose(2, 0, 1), of_points.transpose(2, 0, 1)
+
+
+def group(model: str) -> Group:
+    """Return the gauge group of a camera model, as derived from its formula.
+
+    Parameters
+    ----------
+    model : str
+        Name of the camera model, as ``"projective"`` or ``"SIMPLE_RADIAL"``.
+
+    Returns
+    -------
+    Group
+        Dimension, names and generators.
+
+    Raises
+    ------
+    ArgumentError
+        On an unknown model.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.gauge.group("projective").dimension, eg.gauge.group("bal").dimension
+    (15, 7)
+    """
+    found = camera_model(model)
+    return Group(found.name, found.gauge_dimension, found.gauge_names)
+
+
+def similarity(s: float, R: ArrayLike, t: ArrayLike) -> Similarity:
+    """Return the similarity X -> s R X + t.
+
+    Parameters
+    ----------
+    s : float
+        Scale, positive.
+    R : array_like, shape (3, 3)
+        Rotation.
+    t : array_like, shape (3,)
+        Translation.
+
+    Returns
+    -------
+    Similarity
+        For `transform`.
+
+    Raises
+    ------
+    ArgumentError
+        If the scale is not positive, R no rotation or t not finite.
+
+    Examples
+    --------
+    >>> import numpy as np, epigauge as eg
+    >>> eg.gauge.similarity(2.0, np.eye(3), [1.0, 0.0, 0.0]).positions(np.zeros((1, 3)))
+    array([[1., 0., 0.]])
+    """
+    scale = as_real("s", s, "a positive number")
+    if scale.ndim or not 0.0 < scale < np.inf:
+        raise ArgumentError("s", f"is {s!r:.60}", "a positive number")
+    rotation = as_real("R", R, "a (3, 3) rotation")
+    known = rotation.shape == (3, 3) and np.isfinite(rotation).all()
+    if not known or np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-8:
+        raise ArgumentError("R", "is no rotation", "R with R^T R = I")
+    if np.linalg.det(rotation) < 0.0:
+        raise ArgumentError("R", "is a reflection (determinant -1)", "a rotation")
+    target = as_real("t", t, "three numbers")
+    if target.shape != (3,) or not np.isfinite(target).all():
+        raise ArgumentError("t", f"is {t!r:.60}", "three finite numbers")
+    return Similarity(float(scale), rotation, np.zeros(3), target)
+
+
+@overload
+def transform(reconstruction: MetricReconstruction, T: Similarity) -> MetricReconstruction: ...
+
+
+@overload
 def transform(
     reconstruction: Reconstruction,
     T: ArrayLike,
     camera_scales: ArrayLike = 1.0,
     point_scales: ArrayLike = 1.0,
-) -> Reconstruction:
+) -> Reconstruction: ...
+
+
+def transform(
+    reconstruction: Reconstruction | MetricReconstruction,
+    T: ArrayLike | Similarity,
+    camera_scales: ArrayLike = 1.0,
+    point_scales: ArrayLike = 1.0,
+) -> Reconstruction | MetricReconstruction:
     """Apply a gauge transformation, which changes no projected point.
 
     Parameters
     ----------
-    reconstruction : Reconstruction
+    reconstruction : Reconstruction or MetricReconstruction
         Cameras and points.
-    T : array_like, shape (4, 4)
-        Change of basis, invertible.
+    T : array_like, shape (4, 4), or Similarity
+        Change of basis, invertible; of a metric reconstruction a `similarity`.
     camera_scales, point_scales : array_like
-        Factors of each camera and point, or one for all; none zero.
+        Factors of each camera and point, or one for all; none zero. Metric ones have none.
 
     Returns
     -------
-    Reconstruction
-        P_i' = gamma_i P_i T, Q_j' = alpha_j T^-1 Q_j.
+    Reconstruction or MetricReconstruction
+        P_i' = gamma_i P_i T, Q_j' = alpha_j T^-1 Q_j; or X' = s R X + t, and cameras that see it
+        as before.
 
     Raises
     ------
     ArgumentError
-        If T is singular or a scale is zero.
+        If T is singular, a scale is zero, or T is of the other kind.
     """
+    if isinstance(reconstruction, MetricReconstruction) or isinstance(T, Similarity):
+        kinds = isinstance(reconstruction, MetricReconstruction), isinstance(T, Similarity)
+        if not isinstance(reconstruction, MetricReconstruction) or not isinstance(T, Similarity):
+            what = "is a similarity" if kinds[1] else "is no similarity"
+            kind = "metric" if kinds[0] else "projective"
+            needed = "eg.gauge.similarity(s, R, t)" if kinds[0] else "a (4, 4) matrix"
+            raise ArgumentError("T", f"{what}, the reconstruction {kind}", needed)
+        if not (np.array_equal(camera_scales, 1.0) and np.array_equal(point_scales, 1.0)):
+            raise ArgumentError("camera_scales", "is given", "none for metric reconstructions")
+        moved, X = T.apply(reconstruction.vectors, reconstruction.X)
+        pose = moved[:, :12].reshape(-1, 3, 4)
+        return MetricReconstruction(pose[:, :, :3], pose[:, :, 3], X, reconstruction.cameras)
     matrix = as_real("T", T, "a finite (4, 4) matrix")
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise ArgumentError("T", f"has shape {matrix.shape}", "a finite (4, 4) matrix")
@@ -208,6 +369,10 @@ class identity:
         """Return the transformation that moves nothing."""
         return Transformation(np.eye(4), np.ones(len(P)), np.ones(len(Q)))
 
+    def similarity(self, cameras: Array, points: Array) -> Similarity:
+        """Return the similarity that moves nothing."""
+        return Similarity(1.0, np.eye(3), np.zeros(3), np.zeros(3))
+
 
 @dataclass(frozen=True)
 class reference_camera:
@@ -235,6 +400,12 @@ class reference_camera:
         slide = np.eye(4)
         slide[3, :3], slide[3, 3] = across, size
         return _scaled(T @ slide, P, there[:, 2], self.camera)
+
+    def similarity(self, cameras: Array, points: Array) -> Similarity:
+        """Return what moves the camera to (I | 0), the points' median distance from it to one."""
+        R, centre = _pose(cameras, self.camera)
+        size = float(np.median(np.linalg.norm(points - centre, axis=1)))
+        return Similarity(1.0 / size, R, centre, np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -266,6 +437,11 @@ class two_cameras:
         found.camera_scales[self.second] = 1.0 / np.linalg.norm((P[self.second] @ T)[:, 3])
         return found
 
+    def similarity(self, cameras: Array, points: Array) -> Similarity:
+        """Return what moves the first camera to (I | 0), and the second to distance one."""
+        (R, centre), (_, other) = (_pose(cameras, view) for view in (self.first, self.second))
+        return Similarity(1.0 / float(np.linalg.norm(other - centre)), R, centre, np.zeros(3))
+
 
 @dataclass(frozen=True)
 class five_points:
@@ -285,6 +461,38 @@ class five_points:
         basis = Q[chosen[:4]].T
         T = basis * np.linalg.solve(basis, Q[chosen[4]])
         return _unit_scales(T, P, Q)
+
+    def similarity(self, cameras: Array, points: Array) -> Similarity:
+        """Return what moves three points to (0, 0, 0), (1, 0, 0) and the plane z = 0."""
+        chosen = self.choose_three(points) if self.points is None else list(self.points)
+        first, second, third = points[chosen[:3]]
+        size = float(np.linalg.norm(second - first))
+        x = (second - first) / size
+        z = np.cross(x, third - first)
+        z /= np.linalg.norm(z)
+        return Similarity(1.0 / size, np.stack([x, np.cross(z, x), z]), first, np.zeros(3))
+
+    @staticmethod
+    def choose_three(X: Array) -> list[int]:
+        """Return three points far apart and far from a line, the same in every metric frame.
+
+        Parameters
+        ----------
+        X : ndarray, shape (m, 3)
+            Points; the tenth of them farthest out is left alone.
+
+        Returns
+        -------
+        list of int
+            Their numbers.
+        """
+        out = np.linalg.norm(X - X.mean(axis=0), axis=1)
+        usual = np.where(out <= np.quantile(out, 0.9), 1.0, 0.0)
+        first = int(np.argmax(usual * out))
+        along = np.linalg.norm(X - X[first], axis=1)
+        second = int(np.argmax(usual * along))
+        across = np.linalg.norm(np.cross(X - X[first], X[second] - X[first]), axis=1)
+        return [first, second, int(np.argmax(usual * across))]
 
     @staticmethod
     def choose(Q: Array, candidates: int = 12) -> list[int]:
@@ -337,6 +545,15 @@ class normalized:
         """Return what moves cameras and points into the gauge."""
         return _unit_scales(spreading_basis(Q), P, Q)
 
+    def similarity(self, cameras: Array, points: Array) -> Similarity:
+        """Return what moves the points' mean to the origin and their mean square distance to one.
+
+        Directions stay: a rotation is left open.
+        """
+        centre = points[0] + np.mean(points - points[0], axis=0)
+        size = float(np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1))))
+        return Similarity(1.0 / size, np.eye(3), centre, np.zeros(3))
+
 
 #: The gauges of this module.
 GAUGES = (identity, reference_camera, two_cameras, five_points, normalized)
@@ -361,6 +578,12 @@ def _camera_basis(P: Array) -> Array:
     """Return T with P T = (I | 0): pseudo-inverse, then camera centre."""
     centre = np.linalg.svd(P)[2][3]
     return np.column_stack([np.linalg.pinv(P), centre])
+
+
+def _pose(cameras: Array, view: int) -> tuple[Array, Array]:
+    """Return rotation and centre of a row (R | t) of metric cameras."""
+    pose = cameras[view, :12].reshape(3, 4)
+    return pose[:, :3], -pose[:, :3].T @ pose[:, 3]
 
 
 def _sine(a: Array, b: Array) -> float:

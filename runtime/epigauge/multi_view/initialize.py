@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import lm
 from epigauge._arguments import as_choice, as_count
+from epigauge.bundle.dampings import Covariant
+from epigauge.bundle.moves import best_conditioned
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.problem import Estimate
+from epigauge.bundle.run import bundle_problem
+from epigauge.cameras import camera_model
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table, table
-from epigauge.multi_view.dampings import Covariant
 from epigauge.multi_view.factorization import factorized
 from epigauge.multi_view.frame import Frame
-from epigauge.multi_view.gauge import normalized
-from epigauge.multi_view.problem import BundleProblem
 from epigauge.multi_view.registration import TooFewInCommon, registered
-from epigauge.multi_view.system import Layout
 from epigauge.multi_view.tracks import Reconstruction, Tracks
 from epigauge.two_view.losses import EFFICIENT, Loss, median, robust_scale
 
-__all__ = ["Frame", "initialize"]
+__all__ = ["initialize"]
 
 Array = NDArray[np.float64]
 
@@ -114,7 +118,7 @@ def initialize(
 def _factored(
     tracks: Tracks, frame: Frame, kernels: Table, robust: bool, seed: int
 ) -> Reconstruction:
-    layout = Layout(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+    layout = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
     weights = np.asarray(tracks.weights)
     q = frame.conditioned(tracks)
     P, Q = factorized(kernels, layout, q, weights, seed=seed, robust=robust)
@@ -127,29 +131,32 @@ def _best_factored(tracks: Tracks, frame: Frame, kernels: Table, seed: int) -> R
     A network of short tracks has many minima. The lowest of all that was tried is taken once two
     starts have led to it; where it is found only once, after so many starts.
     """
-    layout = Layout(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+    layout = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
     weights, q = np.asarray(tracks.weights), frame.conditioned(tracks)
-    problem = BundleProblem(kernels, layout, q, weights, Loss(), embedded=True)
+    projective = camera_model("projective")
+    problem = bundle_problem(projective, kernels, layout, q, weights, embedded=True)
     stopping = lm.Stopping(ftol=1e-4, xtol=0.0, gtol=0.0, max_iter=_TRIED)
     best, least = None, np.inf
     for k in range(_TRIES):
-        start = factorized(kernels, layout, q, weights, seed=seed + k // 2, robust=k % 2 == 0)
+        P, Q = factorized(kernels, layout, q, weights, seed=seed + k // 2, robust=k % 2 == 0)
         if best is None:
-            scale = EFFICIENT["cauchy"] * robust_scale(problem.engine.distances(*start))
-            problem.loss = Loss("cauchy", max(float(np.nan_to_num(scale, posinf=1.0)), 1e-12))
+            distances = problem.linearizer.distances(P.reshape(-1, 12), Q)
+            scale = EFFICIENT["cauchy"] * robust_scale(distances)
+            loss = Loss("cauchy", max(float(np.nan_to_num(scale, posinf=1.0)), 1e-12))
+            problem = replace(problem, linearizer=problem.linearizer.with_loss(loss))
         try:
-            home = normalized().transformation(*start)
-            found = lm.minimize(problem, home.apply(*start), Covariant(), lm.Classic(), stopping)
+            moved = best_conditioned(projective, P.reshape(-1, 12), Q).apply(P.reshape(-1, 12), Q)
+            found = lm.minimize(problem, Estimate(*moved), Covariant(), lm.Classic(), stopping)
         except np.linalg.LinAlgError:
             continue
         again = abs(found.state.cost - least) <= _SAME * least
         if best is None or found.state.cost < least:
-            best, least = (found.state.P, found.state.Q), found.state.cost
+            best, least = found.state, found.state.cost
         if again:
             break
     if best is None:
         raise ArgumentError("tracks", "lead to no start", "longer tracks, or a start")
-    return Reconstruction(frame.cameras_out(best[0]), best[1])
+    return Reconstruction(frame.cameras_out(best.cameras.reshape(-1, 3, 4)), best.points)
 
 
 def _median_residual(tracks: Tracks, found: Reconstruction) -> float:

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import lm
+from epigauge.bundle.dampings import Covariant
+from epigauge.bundle.linearizer import Linearizer
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.problem import Estimate
+from epigauge.bundle.run import REFINEMENT, bundle_problem
+from epigauge.cameras import camera_model
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 from epigauge.multi_view.agreement import agreed_camera, agreed_fundamental, agreed_points
-from epigauge.multi_view.dampings import Covariant
 from epigauge.multi_view.frame import Frame, counted
 from epigauge.multi_view.parallax import fit_homographies
-from epigauge.multi_view.problem import BundleProblem
 from epigauge.multi_view.resection import resect
-from epigauge.multi_view.system import Layout
 from epigauge.multi_view.tracks import MIN_POINTS, MIN_VIEWS, Reconstruction, Tracks
 from epigauge.scatter import spread
 from epigauge.two_view.geometry import canonical_cameras
@@ -284,15 +288,19 @@ class _Builder:
         rows = np.flatnonzero(self.registered[self.tracks.view] & self.known[self.tracks.point])
         views, local_views = np.unique(self.tracks.view[rows], return_inverse=True)
         points, local_points = np.unique(self.tracks.point[rows], return_inverse=True)
-        layout = Layout(local_views, local_points, len(views), len(points))
+        graph = ObservationGraph(local_views, local_points, len(views), len(points))
         q = np.ascontiguousarray(self.q[:, rows])
-        problem = BundleProblem(self.kernels, layout, q, np.ones(len(rows)), Loss(), embedded=True)
-        estimate = self.P[views], self.Q[points]
-        scale = EFFICIENT["cauchy"] * robust_scale(problem.engine.distances(*estimate))
-        problem.loss = Loss("cauchy", max(scale, 1e-12))
+        estimate = Estimate(self.P[views].reshape(-1, 12), self.Q[points])
+        parts = camera_model("projective"), self.kernels, graph, q, np.ones(len(rows))
+        problem = bundle_problem(*parts, embedded=True)
+        distances = problem.linearizer.distances(estimate.cameras, estimate.points)
+        scale = EFFICIENT["cauchy"] * robust_scale(distances)
+        robust = problem.linearizer.with_loss(Loss("cauchy", max(scale, 1e-12)))
         stopping = lm.Stopping(ftol=1e-3, xtol=0.0, gtol=0.0, max_iter=5)
-        found = lm.minimize(problem, estimate, Covariant(), lm.Classic(), stopping)
-        self.P[views], self.Q[points] = found.state.P, found.state.Q
+        found = lm.minimize(
+            replace(problem, linearizer=robust), estimate, Covariant(), lm.Classic(), stopping
+        ).state
+        self.P[views], self.Q[points] = found.cameras.reshape(-1, 3, 4), found.points
         self._spread()
 
     def _triangulate(self, view: int | None) -> None:
@@ -306,12 +314,14 @@ class _Builder:
         counts = np.bincount(tracks.point[rows], minlength=tracks.n_points)
         rows = rows[counts[tracks.point[rows]] >= MIN_VIEWS]
         points, local = np.unique(tracks.point[rows], return_inverse=True)
-        layout = Layout(tracks.view[rows], local, tracks.n_views, len(points))
+        graph = ObservationGraph(tracks.view[rows], local, tracks.n_views, len(points))
         q = np.ascontiguousarray(self.q[:, rows])
-        problem = BundleProblem(self.kernels, layout, q, np.ones(len(rows)), Loss())
-        self.Q[points] = _triangulated(self.P, self.Q[points], self.known[points], problem)
+        parts = self.kernels, graph, q, np.ones(len(rows))
+        linearizer = bundle_problem(camera_model("projective"), *parts).linearizer
+        start = self.P, self.Q[points], self.known[points]
+        self.Q[points], scale = _triangulated(*start, linearizer)
         if self.robust:
-            self.Q[points] = agreed_points(problem, self.P, self.Q[points], problem.loss.scale)
+            self.Q[points] = agreed_points(*parts, self.P, self.Q[points], scale)
         self.known[points] = True
 
     def _spread(self) -> None:
@@ -321,14 +331,17 @@ class _Builder:
         self.P[self.registered] = P / np.linalg.norm(P, axis=(1, 2), keepdims=True)
 
 
-def _triangulated(P: Array, Q: Array, known: NDArray[np.bool_], problem: BundleProblem) -> Array:
-    """Return points triangulated linearly where new, then refined, with a robust loss."""
-    linear = problem.engine.intersected(P)
+def _triangulated(
+    P: Array, Q: Array, known: NDArray[np.bool_], linearizer: Linearizer
+) -> tuple[Array, float]:
+    """Return points triangulated linearly where new, then refined, and the robust loss's scale."""
+    cameras = P.reshape(-1, 12)
+    linear = linearizer.intersect(cameras)
     Q = np.where(known[:, None], Q, linear)
-    distances = problem.engine.distances(P, linear)
-    scale = EFFICIENT["cauchy"] * robust_scale(np.nan_to_num(distances, posinf=1e3))
-    problem.loss = Loss("cauchy", max(scale, 1e-12))
+    distances = linearizer.distances(cameras, linear)
+    scale = max(EFFICIENT["cauchy"] * robust_scale(np.nan_to_num(distances, posinf=1e3)), 1e-12)
+    robust = linearizer.with_loss(Loss("cauchy", scale))
     # A known point may have been led astray by the new view's error: keep the better start.
-    costs = [np.nan_to_num(problem.point_costs(P, start), nan=np.inf) for start in (Q, linear)]
+    costs = [np.nan_to_num(robust.point_costs(cameras, start), nan=np.inf) for start in (Q, linear)]
     Q = np.where((costs[0] <= costs[1])[:, None], Q, linear)
-    return problem.triangulated(P, Q)
+    return robust.refine_points(cameras, Q, REFINEMENT)[0], scale

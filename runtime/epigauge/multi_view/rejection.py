@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.bundle.observations import ObservationGraph
 from epigauge.kernels import Table
 from epigauge.multi_view.agreement import agreed_points
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import normalized
-from epigauge.multi_view.problem import BundleProblem
-from epigauge.multi_view.system import Layout
 from epigauge.multi_view.tracks import MIN_VIEWS, Reconstruction, Tracks
-from epigauge.two_view.losses import EFFICIENT, Loss, median
+from epigauge.two_view.losses import EFFICIENT, median
 
 if TYPE_CHECKING:
     from epigauge.multi_view.adjust import BundleResult
@@ -119,9 +118,9 @@ class _Search:
     def __init__(self, tracks: Tracks, kernels: Table) -> None:
         self.tracks, self.frame = tracks, Frame.of(tracks)
         self.counts = tracks.weights > 0.0
-        layout = Layout(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+        graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
         q, weights = self.frame.conditioned(tracks), np.asarray(tracks.weights)
-        self.problem = BundleProblem(kernels, layout, q, weights, Loss())
+        self.parts = kernels, graph, q, weights
 
     def distances(self, found: Any) -> Array:
         """Return the distance of each observation, (N,),  times the root of its weight."""
@@ -142,7 +141,7 @@ class _Search:
             return found
         scale = EFFICIENT["cauchy"] * max(self.typical(found) / _MEDIAN / self.frame.scale, 1e-12)
         P = self.frame.cameras_in(found.P)
-        return Reconstruction(found.P, agreed_points(self.problem, P, found.Q, scale))
+        return Reconstruction(found.P, agreed_points(*self.parts, P, found.Q, scale))
 
     def gross(self, found: Any) -> Mask:
         """Return which observations are gross errors, or all that is left of a point to one."""

@@ -17,17 +17,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
 from epigauge._arguments import as_positive
+from epigauge.bundle.numpy_linearizer import NumpyLinearizer, inverse_roots
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.solve import System
+from epigauge.cameras import camera_model
 from epigauge.errors import ArgumentError
-from epigauge.multi_view.dampings import Covariant
 from epigauge.multi_view.datum import Projector, freedom, mapped, projector
+from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import (
     Gauge,
     identity,
     normalized,
 )
-from epigauge.multi_view.initialize import Frame
-from epigauge.multi_view.problem import BundleProblem, BundleState
-from epigauge.multi_view.system import BundleSystem, Layout
 from epigauge.multi_view.tracks import Reconstruction, Tracks
 from epigauge.two_view.losses import Loss
 
@@ -238,23 +239,21 @@ def covariance(
         )
     frame = Frame.of(tracks)
     home = normalized().transformation(frame.cameras_in(P), Q)
-    layout = Layout(tracks.view, tracks.point, n, m)
-    problem = BundleProblem(
-        kernels.table(backend),
-        layout,
-        frame.conditioned(tracks),
-        np.asarray(tracks.weights),
-        Loss(),
-    )
-    state = problem.evaluate(home.apply(frame.cameras_in(P), Q))
+    graph = ObservationGraph(tracks.view, tracks.point, n, m)
+    table, q = kernels.table(backend), frame.conditioned(tracks)
+    parts = camera_model("projective"), table, graph, q, np.asarray(tracks.weights)
+    linearizer = NumpyLinearizer(*parts, Loss())
+    moved_P, moved_Q = home.apply(frame.cameras_in(P), Q)
+    state = moved_P.reshape(-1, 12), moved_Q
+    cost = 0.5 * float(np.sum(linearizer.point_costs(*state)))
     if noise_px is None:
         redundancy = 2 * int(np.count_nonzero(tracks.weights)) - 11 * n - 3 * m + 15
         if redundancy <= 0:
             raise ArgumentError("noise_px", "is not given", "a number: nothing is redundant")
-        noise_px = frame.scale * float(np.sqrt(2.0 * state.cost / redundancy))
+        noise_px = frame.scale * float(np.sqrt(2.0 * cost / redundancy))
     else:
         noise_px = as_positive("noise_px", noise_px)
-    inverse = _Inverse.of(problem, state, frame.scale)
+    inverse = _Inverse.of(linearizer, state, frame.scale)
     # From whitened parameters at home to the reconstruction as given, in pixels.
     cameras, points = home.inverse().blocks()
     pixels = np.zeros((n, 3, 3))
@@ -277,7 +276,7 @@ class _Inverse:
 
     Attributes
     ----------
-    layout : Layout
+    layout : ObservationGraph
         The observations.
     cameras : ndarray, shape (12 n, 12 n)
         The cameras' part of X.
@@ -287,58 +286,68 @@ class _Inverse:
         Coupling of each observation, and that times V^-1.
     whitening : tuple of ndarray, shape (n, 12, 12), (m, 4, 4)
         Blocks from these parameters to those of the state.
-    state : BundleState
+    state : tuple of ndarray, shape (n, 12), (m, 4)
         Where N was made, in conditioned coordinates.
-    problem : BundleProblem
+    linearizer : NumpyLinearizer
         What made it.
     scale : float
         Pixels a unit of the image.
     """
 
-    layout: Layout
+    layout: ObservationGraph
     cameras: Array
     V_inverse: Array
     W: Array
     Y: Array
     whitening: tuple[Array, Array]
-    state: BundleState
-    problem: BundleProblem
+    state: tuple[Array, Array]
+    linearizer: NumpyLinearizer
     scale: float
 
     @staticmethod
-    def of(problem: BundleProblem, state: BundleState, scale: float) -> _Inverse:
+    def of(linearizer: NumpyLinearizer, state: tuple[Array, Array], scale: float) -> _Inverse:
         """Invert the normal equations at a state."""
         try:
-            system = problem.linearize(state)
-            roots = [np.swapaxes(np.linalg.cholesky(W), 1, 2) for W in Covariant().matrix(system)]
+            normal = linearizer.linearize(*state)
+            assert normal.depth_blocks is not None
+            cameras, points = normal.depth_blocks
+            damping = normal.U + cameras, normal.V + points
+            roots = [np.swapaxes(np.linalg.cholesky(W), 1, 2) for W in damping]
             whitening = (np.asarray(np.linalg.inv(roots[0])), np.asarray(np.linalg.inv(roots[1])))
-            white: BundleSystem = system.transformed(*whitening)
-            p, q, G = freedom(problem.kernels, state.P, state.Q, (roots[0], roots[1]))
-            white = white.damped(p[:, :, None] * p[:, None, :], q[:, :, None] * q[:, None, :])
+            white = System(normal, inverse_roots).tied(*whitening)
+            P, Q = state[0].reshape(-1, 3, 4), state[1]
+            p, q, G = freedom(linearizer.kernels, P, Q, (roots[0], roots[1]))
+            V = white.V + q[:, :, None] * q[:, None, :]
+            V_inverse = np.asarray(np.linalg.inv(V))
+            reduced = white.reduced(inverse_roots(V, V, 0.0, q)[0])
+            n, a = p.shape
+            blocks = reduced.reshape(n, a, n, a)
+            blocks[np.arange(n), :, np.arange(n)] += p[:, :, None] * p[:, None, :]
             moves = G[: p.size]
-            V_inverse = np.asarray(np.linalg.inv(white.V))
-            reduced = white._reduced_matrix() + moves @ moves.T
+            reduced += moves @ moves.T
             values = np.linalg.eigvalsh(reduced)
             if not values[0] > 1e-14 * values[-1]:
                 raise np.linalg.LinAlgError
-            cameras = np.linalg.inv(reduced)
+            inverse = np.asarray(np.linalg.inv(reduced))
         except np.linalg.LinAlgError:
             raise ArgumentError(
                 "reconstruction",
                 "is not determined by the tracks (singular normal equations)",
                 "cameras and points in general position, at a minimum",
             ) from None
-        W = white.coupling.blocks()
-        Y = W @ V_inverse[problem.layout.point]
+        layout = linearizer.graph
+        views, points_of = whitening[0][layout.view], whitening[1][layout.point]
+        W = np.swapaxes(views, 1, 2) @ linearizer.coupling_blocks(*state) @ points_of
+        Y = W @ V_inverse[layout.point]
         return _Inverse(
-            problem.layout,
-            0.5 * (cameras + cameras.T),
+            layout,
+            0.5 * (inverse + inverse.T),
             V_inverse,
             W,
             Y,
             whitening,
             state,
-            problem,
+            linearizer,
             scale,
         )
 
@@ -402,9 +411,9 @@ class _Inverse:
         self, views: Indices, points: Indices, X_ii: Array, X_ij: Array, X_jj: Array
     ) -> Array:
         """Return J X J^T of points in views from the blocks of X."""
-        state = self.state
-        P, Q = state.P.transpose(1, 2, 0)[:, :, views], state.Q.T[:, points]
-        _, J_P, J_Q, _ = self.problem.kernels.project(
+        P = self.state[0].reshape(-1, 3, 4).transpose(1, 2, 0)[:, :, views]
+        Q = self.state[1].T[:, points]
+        _, J_P, J_Q, _ = self.linearizer.kernels.project(
             np.ascontiguousarray(P), np.ascontiguousarray(Q)
         )
         J_camera = J_P.transpose(2, 0, 1) @ self.whitening[0][views]

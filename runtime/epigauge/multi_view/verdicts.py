@@ -7,25 +7,29 @@ scene from N, two views at a time tell: a flat scene or a camera that turns leav
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge import lm
+from epigauge.bundle.dampings import Covariant
+from epigauge.bundle.null_space import generators
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.problem import BundleState, Estimate
+from epigauge.bundle.run import bundle_problem
+from epigauge.bundle.solve import Bordered, BundleSystem, Iterated, reduced_system
+from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.kernels import Table
-from epigauge.multi_view.coupling import Reduced, solved
-from epigauge.multi_view.dampings import Covariant
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import normalized
 from epigauge.multi_view.parallax import parallax_flags
-from epigauge.multi_view.problem import BundleProblem, BundleState
 from epigauge.multi_view.seen import Seen
-from epigauge.multi_view.system import BundleSystem, Layout
 from epigauge.multi_view.tracks import Reconstruction, Tracks
-from epigauge.two_view.losses import Loss, robust_scale
+from epigauge.two_view.losses import robust_scale
 from epigauge.verdicts import ordered
 
-__all__ = ["BEHIND", "Verdict", "behind", "judged", "missing_by_count"]
+__all__ = ["BEHIND", "Verdict", "behind", "judged", "judged_metric", "missing_by_count"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -153,6 +157,33 @@ def judged(
     return Verdict(ordered(raised), full - of_cameras - of_points, n_behind)
 
 
+def judged_metric(
+    tracks: Tracks, found: MetricReconstruction, outcome: lm.Outcome[BundleState]
+) -> Verdict:
+    """Judge an adjusted metric reconstruction.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Observations.
+    found : MetricReconstruction
+        Cameras and points, at the minimum.
+    outcome : Outcome
+        How the minimisation ended.
+
+    Returns
+    -------
+    Verdict
+        Flags, rank, and the number of observations that are not in front of their camera.
+    """
+    n_behind = int(np.count_nonzero(~(found.depths(tracks) > 0.0)))
+    raised = ["behind the cameras"] if n_behind > BEHIND * len(tracks) else []
+    system = outcome.system
+    assert isinstance(system, BundleSystem)
+    unknowns = sum(part.size for part in system.gradients)
+    return Verdict(ordered(raised), unknowns - system.model.gauge_dimension, n_behind)
+
+
 def missing_by_count(seen: Seen) -> int:
     """Return how many parameters lack an equation, whatever the measurements: a lower bound.
 
@@ -190,7 +221,7 @@ def _open_directions(
 
     In parameters in which W of the covariant damping is one, for which the basis does not matter.
     """
-    layout = Layout(seen.view, seen.point, seen.n, seen.m)
+    graph = ObservationGraph(seen.view, seen.point, seen.n, seen.m)
     origins = frame.origins[seen.views]
     own = Frame(origins, frame.scale)
     q = own.points_in(seen.xy, seen.view)
@@ -198,70 +229,78 @@ def _open_directions(
     try:
         # Where a camera or a point is all but undefined, numbers overflow: it is open.
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            problem = BundleProblem(kernels, layout, q, seen.weights, Loss(), workers=workers)
-            home = normalized().transformation(P, seen.Q)
-            P, Q = home.apply(P, seen.Q)
-            system = problem.linearize(BundleState(P, Q, 0.0, problem))
-            found = _measured(system, problem, P, Q)
+            parts = camera_model("projective"), kernels, graph, q, seen.weights
+            problem = bundle_problem(*parts, workers=workers)
+            P, Q = normalized().transformation(P, seen.Q).apply(P, seen.Q)
+            system = problem.linearize(BundleState(Estimate(P.reshape(-1, 12), Q), 0.0))
+            found = _measured(system, kernels)
     except np.linalg.LinAlgError:
         return 1, 0, 0.0
     return found if np.isfinite(found[2]) else (1, 0, 0.0)
 
 
-def _measured(
-    system: BundleSystem, problem: BundleProblem, P: Array, Q: Array
-) -> tuple[int, int, float]:
-    W = Covariant().matrix(system)  # type: ignore[arg-type]
+def _measured(system: BundleSystem, kernels: Table) -> tuple[int, int, float]:
+    W = Covariant().blocks(system)
     # A point whose lines of sight are one leaves W singular, too.
-    lifted = [blocks + 1e-12 * _mean_diagonal(blocks) * np.eye(blocks.shape[1]) for blocks in W]
+    lifted = [
+        blocks + 1e-12 * _mean_diagonal(blocks) * np.eye(blocks.shape[1])
+        for blocks in (W.cameras, W.points)
+    ]
     roots = [np.swapaxes(np.linalg.cholesky(blocks), 1, 2) for blocks in lifted]
-    white = system.transformed(*(np.asarray(np.linalg.inv(root)) for root in roots))
-    p, q, moves = _freedom(problem.kernels, P, Q, roots)
-    white = white.damped(p[:, :, None] * p[:, None, :], q[:, :, None] * q[:, None, :])
-    open_points, V = _grounded(white.V)
-    white = replace(white, V=V)
-    coupling = white.coupling
-    roots_V = coupling.inverse_roots(white.V)
+    whitening = [np.asarray(np.linalg.inv(root)) for root in roots]
+    p, q, moves = _freedom(system, kernels, roots)
     n, a = p.shape
-    reduced = coupling.reduced(white.U, roots_V)
+    white = system.tied(*whitening)
+    U = white.U + p[:, :, None] * p[:, None, :]
+    open_points, V = _grounded(white.V + q[:, :, None] * q[:, None, :])
+    T = whitening[1] @ np.asarray(np.swapaxes(np.linalg.inv(np.linalg.cholesky(V)), 1, 2))
+    coupling = system.normal.coupling
     if n <= _FEW:
-        S = reduced.matrix() + moves @ moves.T
-        values = np.linalg.eigvalsh(S)
+        less = coupling.schur(T, None)[0].dense().transpose(0, 2, 1, 3)
+        S = -(np.swapaxes(whitening[0], 1, 2)[:, None] @ less @ whitening[0])
+        S[np.arange(n), np.arange(n)] += U
+        dense = S.transpose(0, 2, 1, 3).reshape(n * a, n * a)
+        values = np.linalg.eigvalsh(dense + moves @ moves.T)
     else:
-        shift = _SHIFT if reduced.direct else _SHIFT_ITERATIVE
-        shifted = coupling.reduced(white.U + shift * np.eye(a), roots_V)
-        columns = _COLUMNS if reduced.direct else 2
+        shift = _SHIFT if coupling.direct else _SHIFT_ITERATIVE
+        shifted, _ = reduced_system(
+            system.normal, white.ties, T, None, U + shift * np.eye(a), shift
+        )
+        columns = _COLUMNS if coupling.direct else 2
         while True:
             values = _least(shifted, shift, moves, columns)
-            if columns >= n * a // 2 or not reduced.direct or values[-1] > _ROUNDING:
+            if columns >= n * a // 2 or not coupling.direct or values[-1] > _ROUNDING:
                 break
             columns *= 4
     open_cameras = int(np.count_nonzero(values <= _ROUNDING))
     return open_cameras, open_points, float(max(values[0], 0.0))
 
 
-def _freedom(kernels: Table, P: Array, Q: Array, roots: list[Array]) -> tuple[Array, Array, Array]:
+def _freedom(
+    system: BundleSystem, kernels: Table, roots: list[Array]
+) -> tuple[Array, Array, Array]:
     """Return unit directions of the scales, and the changes of basis as S knows them, (12 n, 15).
 
     What N does not see, S does not see in the cameras alone.
     """
-    p = np.einsum("nij,nj->ni", roots[0], P.reshape(-1, 12))
-    q = np.einsum("nij,nj->ni", roots[1], Q)
+    p = np.einsum("nij,nj->ni", roots[0], system.cameras)
+    q = np.einsum("nij,nj->ni", roots[1], system.points)
     p, q = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (p, q))
-    cameras = roots[0] @ kernels.camera_generators(P.transpose(1, 2, 0)).transpose(2, 0, 1)
+    estimate = system.model, kernels, system.cameras, system.points
+    cameras = roots[0] @ generators(*estimate)[0]
     cameras = cameras - p[:, :, None] * np.einsum("ni,nik->nk", p, cameras)[:, None]
-    # The identity only changes scales: one of the sixteen columns is dependent.
-    moves = np.linalg.svd(cameras.reshape(-1, 16), full_matrices=False)[0][:, :_GAUGE]
+    moves = np.linalg.qr(cameras.reshape(p.size, -1))[0]
     return p, q, np.asarray(moves)
 
 
-def _least(shifted: Reduced, shift: float, moves: Array, columns: int) -> Array:
+def _least(shifted: Bordered | Iterated, shift: float, moves: Array, columns: int) -> Array:
     """Return the least eigenvalues of S beside the gauge, from above: inverse iterations."""
-    n, a, _ = shifted.diagonal().shape
-    X = np.random.default_rng(0).standard_normal((n * a, columns))
+    size = len(moves)
+    X = np.random.default_rng(0).standard_normal((size, columns))
     for _ in range(_ITERATIONS):
         X = np.linalg.qr(X - moves @ (moves.T @ X))[0]
-        Y = solved(shifted, X.reshape(n, a, columns)).reshape(n * a, columns)
+        Y = shifted.solve(X.reshape(-1, _CAMERA + 1, columns), np.zeros((0, columns)))[0]
+        Y = Y.reshape(size, columns)
         Y -= moves @ (moves.T @ Y)
         # X^T S^-1 X has the inverse eigenvalues: Ritz values without a product with S.
         inverse = np.linalg.eigvalsh(0.5 * (X.T @ Y + Y.T @ X))[::-1]

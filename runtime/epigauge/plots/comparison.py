@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from epigauge.multi_view.strategies import STRATEGIES
+from epigauge.bundle.strategies import STRATEGIES
 from epigauge.plots._style import GREY, RED, finish, heading, new_figure
 
 if TYPE_CHECKING:

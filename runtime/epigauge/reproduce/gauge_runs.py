@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge import kernels
-from epigauge.multi_view import dampings
+from epigauge import kernels, lm
+from epigauge.bundle.dampings import DAMPINGS
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.problem import BundleProblem, Estimate
+from epigauge.bundle.run import bundle_problem
+from epigauge.bundle.solve import BundleSystem
+from epigauge.cameras import camera_model
 from epigauge.multi_view.adjust import BundleResult, bundle_adjust
+from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import Gauge, Transformation, identity, normalized
-from epigauge.multi_view.initialize import Frame, initialize
-from epigauge.multi_view.problem import BundleProblem
-from epigauge.multi_view.system import Layout
+from epigauge.multi_view.initialize import initialize
 from epigauge.multi_view.tracks import Reconstruction, Tracks
 from epigauge.reproduce.common import Track, tracked
 from epigauge.scenes import multi_view_scene
-from epigauge.two_view.losses import Loss
 
 __all__ = [
     "LABELS",
@@ -143,26 +145,26 @@ class Step:
     ----------
     label : str
         Name in tables.
-    damping : object
-        Turns a system and lambda into a step.
+    damping : str
+        Name of what turns a system and lambda into a step.
     gauge : Gauge
         Basis that the step is computed in before it is moved back.
     """
 
     label: str
-    damping: Any
+    damping: str
     gauge: Gauge = field(default_factory=identity)
 
 
 #: The dampings whose single steps are compared.
 STEPS = (
-    Step("lambda I", dampings.Levenberg()),
-    Step("lambda diag N", dampings.Marquardt()),
-    Step("pseudo-inverse", dampings.PseudoInverse()),
-    Step("Table 1, norm of R^T R", dampings.GaugeInvariant("product")),
-    Step("Table 1, norm of vec R", dampings.GaugeInvariant("factor")),
-    Step("covariant, in the basis given", dampings.Covariant()),
-    Step("covariant, in the normalised basis", dampings.Covariant(), normalized()),
+    Step("lambda I", "levenberg"),
+    Step("lambda diag N", "marquardt"),
+    Step("pseudo-inverse", "none"),
+    Step("Table 1, norm of R^T R", "gauge_invariant"),
+    Step("Table 1, norm of vec R", "gauge_invariant_factor"),
+    Step("covariant, in the basis given", "covariant"),
+    Step("covariant, in the normalised basis", "covariant", normalized()),
 )
 
 
@@ -186,21 +188,28 @@ def step_defect(tracks: Tracks, start: Reconstruction, step: Step, there: Transf
         Zero for a gauge invariant iteration.
     """
     frame = Frame.of(tracks)
-    layout = Layout(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
-    weights = np.ones(len(tracks))
-    problem = BundleProblem(kernels.table(), layout, frame.conditioned(tracks), weights, Loss())
+    graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+    table, q = kernels.table(), frame.conditioned(tracks)
+    problem = bundle_problem(camera_model("projective"), table, graph, q, np.ones(len(tracks)))
+    damping = DAMPINGS[step.damping](table)
     P, Q = frame.cameras_in(start.P), start.Q
-    lam = step.damping.start(problem.linearize(problem.evaluate((P, Q))))
-    expected = _blocks_times(there, _made(problem, P, Q, step, lam))
-    found = _made(problem, *there.apply(P, Q), step, lam)
+    lam = damping.start(_linearized(problem, P, Q))
+    expected = _blocks_times(there, _made(problem, P, Q, step.gauge, damping, lam))
+    found = _made(problem, *there.apply(P, Q), step.gauge, damping, lam)
     return float(np.linalg.norm(found - expected) / np.linalg.norm(found))
 
 
-def _made(problem: BundleProblem, P: Array, Q: Array, step: Step, lam: float) -> Array:
-    """Return a step as one vector, made in the gauge of `step` and moved back."""
-    home = step.gauge.transformation(P, Q)
-    system = problem.linearize(problem.evaluate(home.apply(P, Q)))
-    return _blocks_times(home.inverse(), step.damping.step(system, lam))
+def _linearized(problem: BundleProblem, P: Array, Q: Array) -> BundleSystem:
+    return problem.linearize(problem.evaluate(Estimate(P.reshape(-1, 12), Q)))
+
+
+def _made(
+    problem: BundleProblem, P: Array, Q: Array, gauge: Gauge, damping: lm.Damping, lam: float
+) -> Array:
+    """Return a step as one vector, made in a gauge and moved back."""
+    home = gauge.transformation(P, Q)
+    system = _linearized(problem, *home.apply(P, Q))
+    return _blocks_times(home.inverse(), np.asarray(damping.step(system, lam)))
 
 
 def _blocks_times(there: Transformation, vector: Array) -> Array:

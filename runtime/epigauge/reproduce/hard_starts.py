@@ -7,15 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from epigauge import kernels
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.run import REFINEMENT, bundle_problem
+from epigauge.cameras import camera_model
 from epigauge.multi_view.adjust import BundleResult
+from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import normalized
-from epigauge.multi_view.initialize import Frame, initialize
-from epigauge.multi_view.problem import BundleProblem
-from epigauge.multi_view.system import Layout
+from epigauge.multi_view.initialize import initialize
 from epigauge.multi_view.tracks import Reconstruction, Tracks
 from epigauge.reproduce.gauge_runs import LABELS, GaugeStudy, moved, random_transformation
 from epigauge.reproduce.report import Claim, Section, Table
-from epigauge.two_view.losses import Loss
 
 __all__ = ["starts"]
 
@@ -165,9 +166,10 @@ def _random_reconstruction(
     random: np.random.Generator, tracks: Tracks, frame: Frame
 ) -> Reconstruction:
     """Return random cameras and the points that fit them best, linearly then refined."""
-    layout = Layout(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+    graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
     P = random.normal(size=(tracks.n_views, 3, 4))
     q = frame.conditioned(tracks)
-    problem = BundleProblem(kernels.table(), layout, q, np.ones(len(tracks)), Loss())
-    Q = problem.engine.intersected(P)
-    return Reconstruction(frame.cameras_out(P), problem.triangulated(P, Q))
+    parts = camera_model("projective"), kernels.table(), graph, q, np.ones(len(tracks))
+    linearizer, rows = bundle_problem(*parts).linearizer, P.reshape(-1, 12)
+    Q, _ = linearizer.refine_points(rows, linearizer.intersect(rows), REFINEMENT)
+    return Reconstruction(frame.cameras_out(P), Q)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import lm
-from epigauge.multi_view.problem import BundleProblem, BundleState
+from epigauge.bundle.problem import BundleProblem, BundleState, Estimate
+from epigauge.bundle.solve import BundleSystem, Step
 from epigauge.two_view.losses import Loss, median
 
 __all__ = ["FAR", "JumpingProblem", "minimize", "minimized_from"]
@@ -32,6 +33,7 @@ _FTOL, _STEPS = 1e-3, 15
 _NUDGE = 1e-3
 
 
+@dataclass(frozen=True)
 class JumpingProblem(BundleProblem):
     """A problem whose points may jump, after each step, to where their lines of sight meet.
 
@@ -39,40 +41,55 @@ class JumpingProblem(BundleProblem):
     a bad start stay on the wrong side, and the cameras suffer for it. The linear meeting of the
     lines of sight knows no sides; each point begins from there where it ends at a lower cost.
 
-    Parameters
-    ----------
-    asked : BundleProblem
-        The same measurements with the loss asked for. The loss here is Cauchy's: in the
-        cost of a linear loss few points near a focal plane outweigh all others.
-
-    Attributes
-    ----------
-    cost_asked : float
-        Cost of the estimate last evaluated, in the loss asked for.
+    The loss is Cauchy's: in the cost of a linear loss few points near a focal plane outweigh all
+    others.
     """
 
-    def __init__(self, asked: BundleProblem) -> None:
-        loss = Loss("cauchy", _SCALE)
-        parts = (asked.kernels, asked.layout, asked.q, asked.weights, loss)
-        super().__init__(*parts, embedded=True, workers=asked.workers)
-        self.asked, self.cost_asked = asked, float("inf")
+    @staticmethod
+    def of(asked: BundleProblem) -> JumpingProblem:
+        """Return this for the measurements of a problem."""
+        parts = {part.name: getattr(asked, part.name) for part in fields(BundleProblem)}
+        parts["linearizer"] = asked.linearizer.with_loss(Loss("cauchy", _SCALE))
+        return JumpingProblem(**parts)
 
-    def evaluate(self, estimate: tuple[Array, Array]) -> BundleState:
-        """Return the state of cameras and points; note the cost asked for."""
-        self.cost_asked = self.asked.evaluate(estimate).cost
-        return super().evaluate(estimate)
-
-    def triangulated(self, P: Array, Q: Array) -> Array:
+    def refined(self, cameras: Array, points: Array) -> tuple[Array, Array]:
         """Return the points after iterations of their own, with or without a jump first."""
-        stayed = super().triangulated(P, Q)
-        jumped = super().triangulated(P, self.engine.intersected(P))
-        costs = (np.nan_to_num(self.point_costs(P, Q), nan=np.inf) for Q in (jumped, stayed))
-        return np.where(np.less(*costs)[:, None], jumped, stayed)
+        stayed, costs = super().refined(cameras, points)
+        jumped, others = super().refined(cameras, self.linearizer.intersect(cameras))
+        better = np.less(*(np.nan_to_num(cost, nan=np.inf) for cost in (others, costs)))
+        return np.where(better[:, None], jumped, stayed), np.where(better, others, costs)
+
+
+@dataclass
+class _Watched:
+    """A problem that notes the cost, in the loss asked for, of the estimate last evaluated."""
+
+    jumping: JumpingProblem
+    asked: BundleProblem
+    cost_asked: float = float("inf")
+
+    @property
+    def floor(self) -> float:
+        """Return a cost so low that it is rounding error."""
+        return self.jumping.floor
+
+    def evaluate(self, estimate: Estimate) -> BundleState:
+        """Return the state of cameras and points."""
+        self.cost_asked = self.asked.evaluate(replace(estimate, point_costs=None)).cost
+        return self.jumping.evaluate(estimate)
+
+    def linearize(self, state: BundleState) -> BundleSystem:
+        """Return the normal equations."""
+        return self.jumping.linearize(state)
+
+    def retract(self, state: BundleState, step: Step) -> Estimate:
+        """Return the estimate that a step leads to."""
+        return self.jumping.retract(state, step)
 
 
 def minimize(
     problem: BundleProblem,
-    start: tuple[Array, Array],
+    start: Estimate,
     damping: lm.Damping,
     schedule: lm.Schedule,
     stopping: lm.Stopping,
@@ -95,10 +112,10 @@ def minimize(
         Of all steps. The costs of its history are those asked for, which the first steps, accepted
         by another loss, need not lower one by one.
     """
-    distances = problem.engine.distances(*start)
+    distances = problem.linearizer.distances(start.cameras, start.points)
     if not np.isfinite(distances).all() or median(distances) <= FAR:
         return lm.minimize(problem, start, damping, schedule, stopping, callback, scale)
-    jumping = JumpingProblem(problem)
+    jumping = _Watched(JumpingProblem.of(problem), problem)
     history: list[lm.Row] = []
 
     def record(row: lm.Row) -> object:
@@ -110,7 +127,7 @@ def minimize(
 
     few = lm.Stopping(_FTOL, xtol=0.0, gtol=0.0, max_iter=min(_STEPS, stopping.max_iter))
     first = lm.minimize(jumping, start, damping, lm.Classic(), few, record_first)
-    nearer = problem.evaluate((first.state.P, first.state.Q))
+    nearer = problem.evaluate(replace(first.state.estimate, point_costs=None))
     if scale * nearer.cost > history[0].cost:
         nearer = problem.evaluate(start)
     left = stopping.max_iter - first.nit
@@ -130,8 +147,8 @@ def minimize(
         iteration, seconds = row.iteration + first.nit, row.seconds + first.history[-1].seconds
         return record(replace(row, iteration=iteration, seconds=seconds))
 
-    begun, rest = (nearer.P, nearer.Q), replace(stopping, max_iter=left)
-    second = lm.minimize(problem, begun, damping, schedule, rest, record_second, scale)
+    rest = replace(stopping, max_iter=left)
+    second = lm.minimize(problem, nearer.estimate, damping, schedule, rest, record_second, scale)
     return replace(
         second,
         nfev=len(history),
@@ -143,8 +160,8 @@ def minimize(
 
 def minimized_from(
     minimized: Callable[[Array, Array], tuple[lm.Outcome[BundleState], Array, Array]],
-    P: Array,
-    Q: Array,
+    cameras: Array,
+    points: Array,
 ) -> tuple[lm.Outcome[BundleState], Array, Array]:
     """Minimise from a start or, where no step can be made from it, from one a thousandth away.
 
@@ -152,12 +169,12 @@ def minimized_from(
     ----------
     minimized : callable
         Returns outcome, cameras and points; the steps may turn out singular.
-    P, Q : ndarray, shape (n, 3, 4), (m, 4)
+    cameras, points : ndarray, shape (n, 12), (m, 4)
         The start.
 
     Returns
     -------
-    outcome, P, Q
+    outcome, cameras, points
         Of the better of both.
 
     Raises
@@ -169,17 +186,16 @@ def minimized_from(
     try:
         # A start with a point in a focal plane has no finite blocks: its cost tells.
         with np.errstate(invalid="ignore", over="ignore"):
-            found = minimized(P, Q)
+            found = minimized(cameras, points)
         stuck = not any(row.accepted for row in found[0].history[1:])
         if not (stuck and found[0].status in (-3, -1)):
             return found
     except np.linalg.LinAlgError:
         pass
     rng = np.random.default_rng(0)
-    sizes = np.linalg.norm(P, axis=(1, 2), keepdims=True), np.linalg.norm(Q, axis=1, keepdims=True)
     nudged = (
-        part + _NUDGE * size * rng.normal(size=part.shape)
-        for part, size in zip((P, Q), sizes, strict=True)
+        part + _NUDGE * np.linalg.norm(part, axis=1, keepdims=True) * rng.normal(size=part.shape)
+        for part in (cameras, points)
     )
     try:
         again = minimized(*nudged)

@@ -1,0 +1,164 @@
+"""What is to be minimised and from where, by the kind of the start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.bundle.freedom import Freedom
+from epigauge.bundle.priors import Prior, Priors
+from epigauge.bundle.refinement import fixed_indices, refined_freedom
+from epigauge.cameras import CameraModel, Cameras, MetricReconstruction, camera_model
+from epigauge.errors import ArgumentError
+from epigauge.multi_view.frame import Frame
+from epigauge.multi_view.tracks import Reconstruction, Tracks
+
+__all__ = ["Job", "metric_job", "projective_job"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: Numbers of (R | t) before the intrinsics of a camera.
+_POSE = 12
+
+
+@dataclass(frozen=True)
+class Job:
+    """A minimisation in the rows of the engine.
+
+    Attributes
+    ----------
+    model : CameraModel
+        The camera.
+    q : ndarray, shape (2, N)
+        Measurements, in the unit that is computed in.
+    scale_px : float
+        That unit, in pixels.
+    cameras, points : ndarray, shape (n, c), (m, b)
+        The start.
+    result : callable
+        Makes a reconstruction of cameras and points.
+    freedom : Freedom
+        What the caller leaves free.
+    priors : Priors or None
+        What is known beside the images.
+    fixes_gauge : bool
+        Whether something fixed or known ties the reconstruction to its frame.
+    """
+
+    model: CameraModel
+    q: Array
+    scale_px: float
+    cameras: Array
+    points: Array
+    result: Callable[[Array, Array], Reconstruction | MetricReconstruction]
+    freedom: Freedom = field(default_factory=Freedom)
+    priors: Priors | None = None
+    fixes_gauge: bool = False
+
+
+def projective_job(tracks: Tracks, start: Reconstruction, **of_metric: Any) -> Job:
+    """Return the job of a projective start, in conditioned image coordinates.
+
+    Raises
+    ------
+    ArgumentError
+        If the start has another size than the tracks, or options of metric starts are given.
+    """
+    for name, value in of_metric.items():
+        nothing = (
+            value == "all" if isinstance(value, str) else value is None or not len(list(value))
+        )
+        if not nothing:
+            raise ArgumentError(name, "is given with a projective start", "a metric start")
+    _check_size(tracks, len(start.P), len(start.Q), "cameras")
+    frame = Frame.of(tracks)
+
+    def measured(xy: Array) -> Array:
+        return frame.points_in(xy, tracks.view)
+
+    def result(cameras: Array, points: Array) -> Reconstruction:
+        return Reconstruction(frame.cameras_out(cameras.reshape(-1, 3, 4)), points)
+
+    rows = frame.cameras_in(start.P).reshape(-1, _POSE)
+    q = _trusted(tracks, start, measured)
+    return Job(camera_model("projective"), q, frame.scale, rows, start.Q, result)
+
+
+def metric_job(
+    tracks: Tracks,
+    start: MetricReconstruction,
+    *,
+    refine: Any,
+    fixed_views: Iterable[int],
+    fixed_points: Iterable[int],
+    priors: Iterable[Prior] | None,
+) -> Job:
+    """Return the job of a metric start, in pixels.
+
+    Raises
+    ------
+    ArgumentError
+        On sizes other than the tracks', unknown parameters, priors on what is fixed, or nothing
+        left to refine.
+    """
+    _check_size(tracks, start.n_views, start.n_points, "views")
+    views = fixed_indices("fixed_views", fixed_views, start.n_views)
+    points = fixed_indices("fixed_points", fixed_points, start.n_points)
+    try:
+        listed = list(priors or ())
+    except TypeError:
+        raise ArgumentError("priors", f"is {priors!r:.60}", "a list of priors") from None
+    known = Priors.of(listed, start)
+
+    def result(cameras: Array, X: Array) -> MetricReconstruction:
+        # What was fixed comes back as it was, to the last bit.
+        cameras, X = cameras.copy(), X.copy()
+        cameras[views, :_POSE], X[points] = start.vectors[views, :_POSE], start.X[points]
+        return _reconstruction(start.cameras, cameras, X)
+
+    return Job(
+        camera_model(start.cameras.model),
+        _trusted(tracks, start, lambda xy: np.ascontiguousarray(xy.T)),
+        1.0,
+        start.vectors,
+        start.X,
+        result,
+        refined_freedom(start, refine, views, points, listed),
+        known if len(known) else None,
+        bool(len(views) + len(points) + len(known.views) + len(known.points)),
+    )
+
+
+def _reconstruction(like: Cameras, cameras: Array, X: Array) -> MetricReconstruction:
+    pose = cameras[:, :_POSE].reshape(-1, 3, 4)
+    first = np.unique(like.camera_of_view, return_index=True)[1]
+    made = Cameras(like.model, cameras[first, _POSE:], like.camera_of_view)
+    return MetricReconstruction(pose[:, :, :3], pose[:, :, 3], X, made)
+
+
+def _check_size(tracks: Tracks, n: int, m: int, what: str) -> None:
+    if (n, m) != (tracks.n_views, tracks.n_points):
+        needed = f"{tracks.n_views} and {tracks.n_points}, as the tracks"
+        raise ArgumentError("start", f"has {n} {what} and {m} points", needed)
+
+
+def _trusted(
+    tracks: Tracks,
+    start: Reconstruction | MetricReconstruction,
+    measured: Callable[[Array], Array],
+) -> Array:
+    """Return the measurements (2, N); those of weight zero where the start has them.
+
+    The least weight that keeps the equations regular (`linearizer.LEAST_WEIGHT`) must not draw
+    towards anything, however wrong.
+    """
+    q, off = measured(tracks.xy), tracks.weights == 0.0
+    if off.any():
+        predicted = measured(start.project(tracks))[:, off]
+        q[:, off] = np.where(np.isfinite(predicted), predicted, 0.0)
+    return q

@@ -1,0 +1,201 @@
+"""One method on one job: gauge, damping and freedom put together, and minimised."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge import lm
+from epigauge.bundle import far
+from epigauge.bundle.backends import linearizer_for
+from epigauge.bundle.dampings import DAMPINGS, ByMatrix, Covariant, Implicit
+from epigauge.bundle.jobs import Job
+from epigauge.bundle.linearizer import PointRefinement
+from epigauge.bundle.moves import best_conditioned, move_into
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.problem import BundleProblem, BundleState, Estimate
+from epigauge.bundle.similarity import Similarity
+from epigauge.bundle.strategies import STRATEGIES, freedom_of
+from epigauge.cameras import CameraModel
+from epigauge.errors import ArgumentError
+from epigauge.kernels import Table
+from epigauge.multi_view.gauge import GAUGES, Gauge, five_points, identity
+from epigauge.two_view.losses import Loss
+
+__all__ = ["bundle_problem", "checked_gauge", "minimized"]
+
+Array = NDArray[np.float64]
+
+#: How points are re-triangulated: those of metric cameras are held by their mean entry.
+REFINEMENT = PointRefinement()
+REFINEMENT_METRIC = PointRefinement(lam=1e-4)
+
+#: A residual this small, of the coordinate, is rounding.
+_ROUNDING = 1e-14
+
+#: Dampings, and methods, of projective cameras only.
+_PROJECTIVE = ("gauge_invariant", "gauge_invariant_factor")
+
+
+def bundle_problem(
+    model: CameraModel,
+    kernels: Table,
+    graph: ObservationGraph,
+    q: Array,
+    weights: Array,
+    loss: Loss | None = None,
+    *,
+    embedded: bool = False,
+    workers: int = 1,
+    **parts: Any,
+) -> BundleProblem:
+    """Return the problem of cameras of a model.
+
+    Parameters
+    ----------
+    model : CameraModel
+        The camera.
+    kernels : Table
+        Back end.
+    graph : ObservationGraph
+        Which observation belongs to what.
+    q, weights : ndarray, shape (2, N), (N,)
+        Measurements, and factor of each squared residual.
+    loss : Loss, optional
+        Applied to each squared residual.
+    embedded : bool
+        Re-triangulate the points after each step.
+    workers : int
+        Threads to use where the back end can.
+    **parts
+        Other parts of a `BundleProblem`: freedom, priors.
+    """
+    retract = model.kernel("retract", kernels.name)
+    how = REFINEMENT_METRIC if model.metric else REFINEMENT
+    return BundleProblem(
+        model,
+        linearizer_for(model, kernels, graph, q, weights, loss or Loss(), workers),
+        lambda cameras, own: np.ascontiguousarray(retract(cameras.T, own.T).T),
+        refinement=how if embedded else None,
+        floor=0.5 * float(np.sum(weights * (_ROUNDING * q) ** 2)),
+        **parts,
+    )
+
+
+def checked_gauge(gauge: Any, method: str) -> Gauge | None:
+    """Return a gauge given to a method; a class takes its defaults."""
+    strategy = STRATEGIES[method]
+    if gauge is not None and (strategy.gauge is not None or strategy.reference):
+        raise ArgumentError("gauge", f"is given with method={method!r}", "a method without its own")
+    if isinstance(gauge, type) and issubclass(gauge, GAUGES):
+        gauge = gauge()
+    if gauge is not None and (isinstance(gauge, type) or not hasattr(gauge, "transformation")):
+        raise ArgumentError("gauge", f"is {gauge!r}", "a gauge, such as eg.gauge.normalized()")
+    found: Gauge | None = gauge
+    return found
+
+
+def minimized(
+    job: Job,
+    graph: ObservationGraph,
+    weights: Array,
+    kernels: Table,
+    *,
+    method: str,
+    gauge: Gauge | None,
+    gauge_mode: str,
+    damping: str | None,
+    embedded: bool,
+    schedule: Callable[[], lm.Schedule],
+    loss: Loss,
+    stopping: lm.Stopping,
+    workers: int,
+    callback: Callable[[lm.Row], object] | None,
+) -> tuple[lm.Outcome[BundleState], Array, Array]:
+    """Minimise by a method; return how it ended, and cameras and points in the gauge of the result.
+
+    Raises
+    ------
+    ArgumentError
+        On parts that exclude one another, and a start that leaves the steps undetermined.
+    """
+    strategy = STRATEGIES[method]
+    name = strategy.damping if damping is None else damping
+    if name in _PROJECTIVE and not job.model.homogeneous:
+        what = "damping" if damping else "method"
+        needed = "a projective start, or another method"
+        raise ArgumentError(what, f"is {name!r} for {job.model.name} cameras", needed)
+    act: Any = DAMPINGS[name](kernels)
+    if not isinstance(act, ByMatrix):
+        # Such a step is made for all parameters, free and unconstrained.
+        if strategy.reference or strategy.constrained:
+            raise ArgumentError(
+                "damping", f"is {name!r} with method={method!r}", "one that adds a matrix"
+            )
+        if gauge is not None and gauge_mode == "implicit":
+            raise ArgumentError(
+                "gauge_mode", "is 'implicit' with a damping that adds no matrix", "'explicit'"
+            )
+    moving = gauge is not None or strategy.gauge is not None or name == "none"
+    if job.fixes_gauge and moving:
+        was = f"leaves the gauge to be chosen, which what is fixed or known does ({method!r})"
+        raise ArgumentError("method", was, "method='covariant', without a gauge")
+    explicit = strategy.gauge if strategy.explicit else gauge
+    if gauge is not None and gauge_mode == "implicit":
+        act, explicit = Implicit(act, gauge), None
+    chosen: tuple[int, ...] = ()
+    own_gauge = strategy.gauge
+    if strategy.reference == "points":
+        choose = five_points.choose if job.model.homogeneous else five_points.choose_three
+        chosen = tuple(choose(job.points))
+        own_gauge = five_points(chosen)
+    # The best conditioned frame, where the method does not mind and the caller does not ask.
+    wanted = own_gauge or explicit
+    home = isinstance(act, Covariant) and gauge is None and wanted is None
+    homogeneous = job.model.homogeneous
+
+    def attempt(cameras: Array, points: Array) -> tuple[lm.Outcome[BundleState], Array, Array]:
+        start = job.model, cameras, points
+        there = best_conditioned(*start) if home else move_into(wanted or identity(), *start)
+        cameras, points = there.apply(cameras, points)
+        priors = job.priors
+        if priors is not None:
+            assert isinstance(there, Similarity)
+            priors = priors.moved(there)
+        problem = bundle_problem(
+            job.model,
+            kernels,
+            graph,
+            job.q,
+            weights,
+            loss,
+            embedded=embedded and strategy.embedded and name == "covariant",
+            workers=workers,
+            freedom=freedom_of(
+                strategy, explicit, job.model, kernels, cameras, chosen, job.freedom
+            ),
+            priors=priors,
+        )
+        # Points jump alike whatever the basis, but only in the one chosen here: in no gauge.
+        jumps = homogeneous and problem.refinement is not None and gauge is None
+        minimize = far.minimize if jumps else lm.minimize
+        begun, unit = Estimate(cameras, points), job.scale_px**2
+        outcome = minimize(problem, begun, act, schedule(), stopping, callback, unit)
+        found = outcome.state.cameras, outcome.state.points
+        return (outcome, *(there.inverse().apply(*found) if home else found))
+
+    try:
+        if homogeneous:
+            return far.minimized_from(attempt, job.cameras, job.points)
+        return attempt(job.cameras, job.points)
+    except np.linalg.LinAlgError:
+        raise ArgumentError(
+            "start",
+            f"leaves the steps of method={method!r} undetermined (singular normal equations), and "
+            "so does one a thousandth away",
+            "cameras with different centres, points away from them and not in one plane, or "
+            "method='covariant'",
+        ) from None
