@@ -184,5 +184,5 @@ def _c_changes(text: str) -> Iterator[Change]:
 
 def _blanked(text: str) -> str:
     """Return C with blanks for comments, strings and directives."""
-    pattern = r'/\*.*?\*/|"(?:\\.|[^"\\])*"|^[ \t]*#(?:\\\n|.)*$'
+    pattern = r'/\*.*?\*/|"(?:\\.|[^"\\])*"|^[ \t]*#(?:\\\n|[^\n])*$'
     return re.sub(pattern, lambda m: re.sub(r"[^\n]", " ", m[0]), text, flags=re.S | re.M)

@@ -107,6 +107,19 @@ def test_options_reach_the_solver_and_those_of_the_database_are_refused(database
         eg.colmap.refine_database(database, workers=0)
 
 
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_database_is_closed_at_the_end_whatever_happens(database, fails) -> None:
+    reader = ColmapDatabase(database)
+    try:
+        with reader:
+            if fails:
+                raise KeyError("something else")
+    except KeyError:
+        assert fails
+    with pytest.raises(eg.FileFormatError, match="closed"):
+        reader.names()
+
+
 def test_reading_leaves_nothing_behind(by_colmap) -> None:
     before = files(by_colmap.parent)
     assert list(before) == ["by_colmap.db"]

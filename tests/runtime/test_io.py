@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from epigauge.io._common import listed
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import MAX_MATCHES, Matches, load_matches, plain, save_matches, save_result
 from epigauge.io._npz import write_npz
@@ -570,3 +571,12 @@ def test_directory_is_not_replaced(tmp_path) -> None:
     (tmp_path / "r.json").mkdir()
     with pytest.raises(OSError, match="not a regular file"):
         save_result(tmp_path / "r.json", RESULT)
+
+
+@pytest.mark.parametrize("count", [0, 1, 8, 9])
+def test_a_list_of_names_says_that_there_are_more_where_there_are(count) -> None:
+    names = [f"name{k}" for k in range(count)]
+    text = listed(names)
+    assert text.count("name") == min(count, 8)
+    assert text.endswith("...") == (count > 8)
+    assert (text == "nothing") == (count == 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -173,6 +174,18 @@ class TestArrow:
             s = rng.standard_normal(len(N))
             model = blocks.gradient @ s + 0.5 * s @ N @ s
             assert blocks.predicted(s) == pytest.approx(-model, rel=1e-12)
+
+    def test_predicted_counts_the_constraints_of_the_border(self) -> None:
+        blocks, N = arrow(4)
+        rng = np.random.default_rng(2)
+        border = rng.standard_normal((*blocks.g_points.shape, 2))
+        bordered = replace(blocks, border=border)
+        full = np.vstack([np.zeros((len(blocks.U), 2)), border.reshape(-1, 2)])
+        N = N + full @ full.T
+        for _ in range(5):
+            s = rng.standard_normal(len(N))
+            model = blocks.gradient @ s + 0.5 * s @ N @ s
+            assert bordered.predicted(s) == pytest.approx(-model, rel=1e-12)
 
     def test_largest_is_that_of_the_diagonal(self) -> None:
         for seed in range(10):  # whether the motion or a point holds it

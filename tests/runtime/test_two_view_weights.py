@@ -126,17 +126,18 @@ def test_weights_twice_as_large_are_twice_the_cost_of_the_same_geometry(way: str
 def test_weights_and_isotropic_covariances_say_the_same() -> None:
     scene, weights, rng = weighted_scene()
     split = rng.uniform(0.5, 2.0, len(weights))
-    plain = eg.refine_fundamental(scene.x1, scene.x2, weights=weights, hessian="gauss-newton")
+    options: dict[str, Any] = {"hessian": "gauss-newton", "ftol": 1e-14}
+    plain = eg.refine_fundamental(scene.x1, scene.x2, weights=weights, **options)
     C = np.eye(2) * (split / weights)[:, None, None]
     both = eg.refine_fundamental(
-        scene.x1, scene.x2, weights=split, covariance1=C, covariance2=C, noise_px=1.0
+        scene.x1, scene.x2, weights=split, covariance1=C, covariance2=C, noise_px=1.0, **options
     )
     assert same_geometry(both.F, plain.F, scene.x1, scene.x2) < 1e-6
     assert both.cost == pytest.approx(plain.cost, rel=1e-10)
     size = np.abs(plain.covariance).max()
     np.testing.assert_allclose(both.covariance, plain.covariance, rtol=0.0, atol=1e-5 * size)
     # The equations that led there were weighted, too: full steps, not many short ones.
-    assert both.nfev <= plain.nfev + 1
+    assert both.nfev <= plain.nfev + 2
 
 
 def test_one_covariance_alone_leaves_the_other_image_at_one_pixel() -> None:
