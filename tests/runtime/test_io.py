@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from epigauge.io._common import listed
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import MAX_MATCHES, Matches, load_matches, plain, save_matches, save_result
+from epigauge.io._common import listed
 from epigauge.io._npz import write_npz
 from epigauge.io.output import writing
 from hypothesis import HealthCheck, given, settings
