@@ -32,7 +32,9 @@ STYLES: dict[str, dict[str, Any]] = {
     "KANATANI": {"color": "#17becf", "marker": "d", "ls": "-."},
     "GAUGE_INVARIANT": {"color": "#c1121f", "marker": "o", "ls": "-"},
     "GAUGE_INVARIANT, rank one": {"color": "#c1121f", "marker": "x", "ls": ":"},
+    "GAUGE_INVARIANT, with step 3": {"color": "#c1121f", "marker": "s", "ls": "--"},
     "COVARIANT": {"color": "black", "marker": "*", "ls": "-"},
+    "COVARIANT, points not embedded": {"color": "black", "marker": "+", "ls": "--"},
     "BLOCK eliminated, exact Hessian": {"color": "#17becf", "marker": "d", "ls": "-"},
 }
 

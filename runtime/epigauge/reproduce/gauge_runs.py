@@ -46,8 +46,17 @@ LABELS = {
     "mclauchlan": "MCLAUCHLAN",
     "kanatani": "KANATANI",
     "gauge_invariant": "GAUGE_INVARIANT",
+    "gauge_invariant_normalized": "GAUGE_INVARIANT, with step 3",
     "gauge_invariant_factor": "GAUGE_INVARIANT, rank one",
+    "covariant_alone": "COVARIANT, points not embedded",
     "covariant": "COVARIANT",
+}
+
+#: What is passed to `bundle_adjust` for entries of `LABELS` that are no methods of it. Step 3 of
+#: Table 1 is a projection onto a global gauge after each step, which the paper recommends.
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "gauge_invariant_normalized": {"method": "gauge_invariant", "gauge": normalized()},
+    "covariant_alone": {"method": "covariant", "embedded": False},
 }
 
 _FTOL, _MAX_ITER = 1e-8, 100
@@ -93,7 +102,8 @@ class GaugeStudy:
 
     def adjust(self, tracks: Tracks, start: Reconstruction, method: str) -> BundleResult:
         """Run a method with the stopping rule of all experiments."""
-        return bundle_adjust(tracks, start, method=method, ftol=_FTOL, max_iter=_MAX_ITER)
+        options = _OPTIONS.get(method, {"method": method})
+        return bundle_adjust(tracks, start, ftol=_FTOL, max_iter=_MAX_ITER, **options)
 
     def measured(self, name: str, step: int = 1) -> Tracks | None:
         """Return a measured sequence, its clean tracks in every `step`-th view, or None."""

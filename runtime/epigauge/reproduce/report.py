@@ -17,7 +17,7 @@ from epigauge.plots import save_figure
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Claim", "Picture", "Section", "Table", "write_report", "write_section"]
+__all__ = ["Claim", "Picture", "Section", "Table", "lower", "write_report", "write_section"]
 
 Cell = str | int | float | None
 
@@ -78,21 +78,30 @@ class Claim:
         Where it is made.
     statement : str
         The statement.
-    confirmed : bool
-        Whether our numbers agree.
+    confirmed : bool or None
+        Whether our numbers agree; None where they are too near one another to tell.
     numbers : str
         Our numbers.
     """
 
     source: str
     statement: str
-    confirmed: bool
+    confirmed: bool | None
     numbers: str
 
     @property
     def verdict(self) -> str:
         """Return the verdict in words."""
+        if self.confirmed is None:
+            return "tie"
         return "confirmed" if self.confirmed else "not confirmed"
+
+
+def lower(ours: float, others: float, within: float) -> bool | None:
+    """Tell whether a number is lower than another; None where they differ by less than a part."""
+    if abs(ours - others) <= within * max(abs(ours), abs(others)):
+        return None
+    return ours < others
 
 
 @dataclass(frozen=True)

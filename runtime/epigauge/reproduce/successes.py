@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.reproduce.common import DISTANCES, ELIMINATED, LM, METHODS, SEBER, XI, Study
+from epigauge.reproduce.common import DISTANCES, ELIMINATED, LM, METHODS, SEBER, XI, Setup, Study
 from epigauge.reproduce.figures import Panel, curves
-from epigauge.reproduce.report import Claim, Picture, Section, Table
+from epigauge.reproduce.report import Claim, Picture, Section, Table, lower
 
 __all__ = ["methods_section", "success", "table3"]
 
@@ -55,6 +55,16 @@ def success(E_initial: Array, E_after: Array, xi: float) -> NDArray[np.bool_]:
     return np.asarray(agrees.all(axis=1))
 
 
+def restarted(study: Study, setup: Setup, damping: str, xi: float) -> Array:
+    """Return the error of each method (rows) started where each other one (columns) ended."""
+    return np.array(
+        [
+            [study.run(setup, M, damping, xi, after=other).error_px for other in METHODS]
+            for M in METHODS
+        ]
+    )
+
+
 def table3(study: Study) -> Section:
     """Run Table 3 with the paper's definition.
 
@@ -78,12 +88,8 @@ def table3(study: Study) -> Section:
         for i, distance in enumerate(study.track(DISTANCES, f"success, {case}")):
             for k, setup in enumerate(study.setups(distance=distance)):
                 runs = [study.run(setup, method, damping, xi) for method in METHODS]
-                after = [
-                    [study.run(setup, M, damping, xi, after=other).error_px for other in METHODS]
-                    for M in METHODS
-                ]
                 errors = np.array([run.error_px for run in runs])
-                found[i, k] = success(errors, np.array(after), xi)
+                found[i, k] = success(errors, restarted(study, setup, damping, xi), xi)
                 count += [run.broke for run in runs]
         rates[case] = 100.0 * found.mean(axis=1).T
         broken[case] = count
@@ -230,7 +236,7 @@ def methods_section(study: Study) -> Section:
             Claim(
                 "not in the paper",
                 "ORTHO eliminated with exact Hessian needs the fewest evaluations",
-                bool(fewest[exact] <= fewest[others].min()),
+                lower(fewest[exact], fewest[others].min(), 0.02),
                 f"{fewest[exact]:.1f} on average over the distances; BLOCK likewise "
                 f"{fewest[-1]:.1f}; best of the others {fewest[others].min():.1f} "
                 f"({names[others[int(np.argmin(fewest[others]))]]})",
@@ -238,7 +244,7 @@ def methods_section(study: Study) -> Section:
             Claim(
                 "not in the paper",
                 "ORTHO eliminated with exact Hessian reaches the lowest error most often",
-                bool(best[exact] >= best[others].max()),
+                lower(-best[exact], -best[others].max(), 0.01),
                 f"{best[exact]:.1f} % of the trials; BLOCK likewise {best[-1]:.1f} %; best of the "
                 f"others {best[others].max():.1f} % "
                 f"({names[others[int(np.argmax(best[others]))]]})",
@@ -246,7 +252,7 @@ def methods_section(study: Study) -> Section:
             Claim(
                 "not in the paper",
                 "ORTHO eliminated with exact Hessian takes the least time",
-                bool(cheapest[exact] <= cheapest[others].min()),
+                lower(cheapest[exact], cheapest[others].min(), 0.1),
                 f"{cheapest[exact]:.3f} ms; BLOCK likewise {cheapest[-1]:.3f} ms; best of the "
                 f"others {cheapest[others].min():.3f} ms "
                 f"({names[others[int(np.argmin(cheapest[others]))]]})",
