@@ -139,11 +139,13 @@ def _equations(
         X = [mpmath.mpf(rng.uniform(-1, 1)) for _ in range(model.point_size)]
         J_camera, J_point = (matrix.tolist() for matrix in evaluate(camera, X))
         vector = [*X, mpmath.mpf(1)][:4]
-        for own, by_point in zip(J_camera, J_point, strict=True):
-            row = [*own, *(slope * entry for slope in by_point for entry in vector)]
-            # Not every point has an image: a root may be imaginary.
-            if all(isinstance(entry, mpmath.mpf) and mpmath.isfinite(entry) for entry in row):
-                rows.append(row)
+        pair = [
+            [*own, *(slope * entry for slope in by_point for entry in vector)]
+            for own, by_point in zip(J_camera, J_point, strict=True)
+        ]
+        # Not every point has an image: a root may be imaginary.
+        if all(isinstance(e, mpmath.mpf) and mpmath.isfinite(e) for row in pair for e in row):
+            rows += pair
         if len(rows) >= wanted:
             return rows
     raise ValueError(f"{model.name}: points in general position have no image")
