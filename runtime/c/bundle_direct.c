@@ -1,15 +1,5 @@
 /* The direct route: any camera model of the generated table, by its Jacobians. */
-#include <math.h>
-
 #include "bundle_pairs.h"
-
-/* Widths of rows that the loops over pairs are compiled for, up to EG_MOST_TANGENT. */
-#define WIDTHS(CASE) CASE(8) CASE(12) CASE(16) CASE(20) CASE(24) CASE(32)
-
-static const eg_camera_model *model_of(const eg_pass *p)
-{
-    return eg_camera_models + p->bundle->model;
-}
 
 static void square(const eg_pass *p, const double *EG_RESTRICT r)
 {
@@ -22,7 +12,7 @@ static void square(const eg_pass *p, const double *EG_RESTRICT r)
 
 static void squared(const eg_pass *p)
 {
-    model_of(p)->residual(p->chunk.M, p->cameras, p->points, p->q, p->work);
+    eg_model_of(p)->residual(p->chunk.M, p->cameras, p->points, p->q, p->work);
     square(p, p->work);
 }
 
@@ -53,24 +43,10 @@ static void sight(const eg_pass *p, const double *points, double *own)
 {
     const ptrdiff_t M = p->chunk.M;
     double *r = p->work, *J = r + 2 * M;
-    model_of(p)->sight(M, p->cameras, points, p->q, r, J);
+    eg_model_of(p)->sight(M, p->cameras, points, p->q, r, J);
     square(p, r);
     eg_weigh(p);
     point_sums(p, r, J, own);
-}
-
-/* Rows of both coordinates of a lane's Jacobian J (2, tangent of the model), filled up with zeros. */
-EG_INLINE void turn_camera(const eg_pass *p, ptrdiff_t padded, const double *J, ptrdiff_t j,
-                               double *EG_RESTRICT first, double *EG_RESTRICT second)
-{
-    const ptrdiff_t M = p->chunk.M, K = p->route->tangent, d = model_of(p)->tangent_size;
-    const int32_t *column = p->bundle->columns;
-    for (ptrdiff_t k = 0; k < K; ++k) {
-        first[k] = J[column[k] * M + j];
-        second[k] = J[(d + column[k]) * M + j];
-    }
-    for (ptrdiff_t k = K; k < padded; ++k)
-        first[k] = second[k] = 0.0;
 }
 
 /* Sums of the cameras of a slot, K rows of J^T J and one of the gradient. */
@@ -82,7 +58,7 @@ EG_INLINE void camera_sums(const eg_pass *p, ptrdiff_t padded, const double *r, 
         double first[EG_MOST_TANGENT], second[EG_MOST_TANGENT];
         double *EG_RESTRICT sum = cameras + p->route->camera_sums * p->view[j];
         const double w = p->w[j], e = w * r[j], f = w * r[M + j];
-        turn_camera(p, padded, J, j, first, second);
+        eg_turn_camera(p, padded, J, j, first, second);
         for (ptrdiff_t a = 0; a < K; ++a) {
             const double x = w * first[a], y = w * second[a];
             EG_SIMD
@@ -99,13 +75,13 @@ static void observe(const eg_pass *p, double *own, double *cameras)
 {
     const ptrdiff_t M = p->chunk.M, padded = p->route->padded;
     double *r = p->work, *J = r + 2 * M, *J_camera = J + 2 * p->route->point * M;
-    model_of(p)->observe(M, p->cameras, p->points, p->q, r, J_camera, J);
+    eg_model_of(p)->observe(M, p->cameras, p->points, p->q, r, J_camera, J);
     square(p, r);
     eg_weigh(p);
     point_sums(p, r, J, own);
     switch (padded) {
 #define CASE(W) case W: camera_sums(p, W, r, J_camera, cameras); break;
-        WIDTHS(CASE)
+        EG_WIDTHS(CASE)
 #undef CASE
     }
 }
@@ -115,8 +91,8 @@ static void couple(const eg_pass *p, const double *roots, double *F)
 {
     const ptrdiff_t M = p->chunk.M, b = p->route->point;
     double *r = p->work, *J = r + 2 * M;
-    double *EG_RESTRICT Z = F + 2 * model_of(p)->tangent_size * M;
-    model_of(p)->observe(M, p->cameras, p->points, p->q, r, F, J);
+    double *EG_RESTRICT Z = F + 2 * eg_model_of(p)->tangent_size * M;
+    eg_model_of(p)->observe(M, p->cameras, p->points, p->q, r, F, J);
     if (p->bundle->loss != EG_LINEAR)
         square(p, r);
     eg_weigh(p);
@@ -141,7 +117,7 @@ static void couple(const eg_pass *p, const double *roots, double *F)
 static void to_points(const eg_pass *p, const double *F, const double *x, double *v)
 {
     const ptrdiff_t M = p->chunk.M, b = p->route->point, K = p->route->tangent;
-    const ptrdiff_t d = model_of(p)->tangent_size;
+    const ptrdiff_t d = eg_model_of(p)->tangent_size;
     const int32_t *column = p->bundle->columns;
     const double *Z = F + 2 * d * M;
     double *EG_RESTRICT u = p->work;
@@ -166,7 +142,7 @@ static void to_points(const eg_pass *p, const double *F, const double *x, double
 static void to_cameras(const eg_pass *p, const double *F, const double *v, double *cameras)
 {
     const ptrdiff_t M = p->chunk.M, b = p->route->point, K = p->route->tangent;
-    const ptrdiff_t d = model_of(p)->tangent_size;
+    const ptrdiff_t d = eg_model_of(p)->tangent_size;
     const int32_t *column = p->bundle->columns;
     const double *Z = F + 2 * d * M;
     for (ptrdiff_t j = 0; j < p->filled; ++j) {
@@ -180,76 +156,6 @@ static void to_cameras(const eg_pass *p, const double *F, const double *v, doubl
             camera[k] += F[column[k] * M + j] * x + F[(d + column[k]) * M + j] * y;
     }
 }
-
-/* Y = J^T Z of every observation of a chunk, turned: b rows of the padded width. */
-EG_INLINE void turn(const eg_pass *p, ptrdiff_t padded, ptrdiff_t b, const double *F,
-                        double *EG_RESTRICT turned)
-{
-    const eg_chunk *chunk = &p->chunk;
-    const ptrdiff_t M = chunk->M, L = chunk->L, d = model_of(p)->tangent_size;
-    for (ptrdiff_t s = 0; s < L; ++s, F += p->route->factors * M) {
-        const double *Z = F + 2 * d * M;
-        for (ptrdiff_t j = 0; j < M && s < chunk->count[j]; ++j) {
-            double first[EG_MOST_TANGENT], second[EG_MOST_TANGENT];
-            double *EG_RESTRICT Y = turned + padded * b * (L * j + s);
-            turn_camera(p, padded, F, j, first, second);
-            for (ptrdiff_t k = 0; k < b; ++k) {
-                const double x = Z[k * M + j], y = Z[(b + k) * M + j];
-                EG_SIMD
-                for (ptrdiff_t c = 0; c < padded; ++c)
-                    Y[padded * k + c] = x * first[c] + y * second[c];
-            }
-        }
-    }
-}
-
-/* sum += Y_s Y_t^T over a run of lanes, two rows at a time; a row for each unknown of the view with
-   the lower number. */
-EG_INLINE void add_block(ptrdiff_t K, ptrdiff_t padded, ptrdiff_t b, ptrdiff_t run, ptrdiff_t stride,
-                         const double *EG_RESTRICT Ys, const double *EG_RESTRICT Yt,
-                         double *EG_RESTRICT sum)
-{
-    for (ptrdiff_t a = 0; a < K; a += 2) {
-        double first[EG_MOST_TANGENT], second[EG_MOST_TANGENT];
-        for (ptrdiff_t c = 0; c < padded; ++c)
-            first[c] = second[c] = 0.0;
-        for (ptrdiff_t j = 0; j < run; ++j)
-            for (ptrdiff_t k = 0; k < b; ++k) {
-                const double x = Ys[stride * j + padded * k + a], y = Ys[stride * j + padded * k + a + 1];
-                const double *EG_RESTRICT z = Yt + stride * j + padded * k;
-                EG_SIMD
-                for (ptrdiff_t c = 0; c < padded; ++c) {
-                    first[c] += x * z[c];
-                    second[c] += y * z[c];
-                }
-            }
-        EG_SIMD
-        for (ptrdiff_t c = 0; c < padded; ++c) {
-            sum[padded * a + c] += first[c];
-            sum[padded * (a + 1) + c] += second[c];
-        }
-    }
-}
-
-/* The loops over pairs, for points of three and four entries; W is the padded width. */
-#define PAIRS(NAME, W, B)                                                                          \
-    EG_INLINE void add_##NAME(const eg_route *route, ptrdiff_t run, ptrdiff_t stride,              \
-                              const double *Ys, const double *Yt, const double *moments,           \
-                              double *sum)                                                         \
-    {                                                                                              \
-        (void)moments;                                                                             \
-        add_block(route->tangent, W, B, run, stride, Ys, Yt, sum);                                 \
-    }                                                                                              \
-    static void pairs_##NAME(const eg_pass *p, const eg_envelope *envelope, const double *F,       \
-                             double *turned, ptrdiff_t *views, int32_t *sorted, double *sums)      \
-    {                                                                                              \
-        turn(p, W, B, F, turned);                                                                  \
-        eg_add_by_view(p, envelope, (B) * (W), EG_RUN, turned, views, sorted, sums,                \
-                       NULL, add_##NAME);                                                          \
-    }
-#define CASE(W) PAIRS(three_##W, W, 3) PAIRS(four_##W, W, 4)
-WIDTHS(CASE)
-#undef CASE
 
 /* Row of a camera model by the name that its kernels begin with; -1 where there is none. */
 ptrdiff_t eg_camera_model_row(const char *name)
@@ -265,13 +171,13 @@ eg_route eg_direct_route(const eg_bundle *bundle)
     const eg_camera_model *model = eg_camera_models + bundle->model;
     const ptrdiff_t K = bundle->width, b = model->point_size, d = model->tangent_size;
     const ptrdiff_t padded = K <= 8 ? 8 : K <= 24 ? (K + 3) / 4 * 4 : 32;
-    eg_route route = {
+    const eg_route route = {
         .camera = model->camera_size,
         .point = b,
         .tangent = K,
         .padded = padded,
         .camera_sums = padded * (K + 1),
-        .pair_sums = padded * ((K + 1) / 2 * 2),
+        .pair_sums = padded * K,
         .sums = b * (b + 1) / 2 + b,
         .factors = 2 * d + 2 * b,
         .turned = b * padded,
@@ -282,12 +188,7 @@ eg_route eg_direct_route(const eg_bundle *bundle)
         .couple = couple,
         .to_points = to_points,
         .to_cameras = to_cameras,
-        .pairs = b == 3 ? pairs_three_32 : pairs_four_32,
+        .pairs = eg_direct_pairs(padded, b),
     };
-    switch (padded) {
-#define CASE(W) case W: route.pairs = b == 3 ? pairs_three_##W : pairs_four_##W; break;
-        WIDTHS(CASE)
-#undef CASE
-    }
     return route;
 }

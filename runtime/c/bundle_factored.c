@@ -82,90 +82,6 @@ static void to_cameras(const eg_pass *p, const double *F, const double *v, doubl
     }
 }
 
-/* Lanes that hold a point, where all of these are seen by the same views, once; else 0. */
-static ptrdiff_t alike(const eg_chunk *chunk)
-{
-    const ptrdiff_t M = chunk->M, lanes = eg_filled(chunk, 0, M);
-    if (chunk->count[lanes - 1] < chunk->count[0])
-        return 0;
-    for (ptrdiff_t s = 0; s < chunk->L; ++s)
-        if (eg_run(chunk->view + s * M, 0, lanes) < lanes || eg_repeated(chunk, s, 0))
-            return 0;
-    return lanes;
-}
-
-/* Add to the pairs of a chunk whose points are seen by the same views: pair by pair, the factors
-   F_s F_t^T of all points at once (in work), the sums in registers. */
-static void add_alike(const eg_pass *p, const eg_envelope *envelope, ptrdiff_t lanes,
-                      const double *F, double *pairs)
-{
-    const eg_chunk *chunk = &p->chunk;
-    const ptrdiff_t M = chunk->M;
-    double *X = p->work;
-    for (ptrdiff_t t = 0; t < chunk->L; ++t)
-        for (ptrdiff_t s = 0; s <= t; ++s) {
-            const double *Fs = F + 12 * s * M, *Ft = F + 12 * t * M;
-            double *sum = eg_pair_of(envelope, EG_PAIR, chunk->view[t * M], chunk->view[s * M], pairs);
-            for (int a = 0; sum && a < 3; ++a)
-                for (int b = 0; b < 3; ++b) {
-                    EG_SIMD
-                    for (ptrdiff_t j = 0; j < M; ++j)
-                        X[(3 * a + b) * M + j] =
-                            Fs[(4 * a) * M + j] * Ft[(4 * b) * M + j]
-                            + Fs[(4 * a + 1) * M + j] * Ft[(4 * b + 1) * M + j]
-                            + Fs[(4 * a + 2) * M + j] * Ft[(4 * b + 2) * M + j]
-                            + Fs[(4 * a + 3) * M + j] * Ft[(4 * b + 3) * M + j];
-                }
-            for (int e = 0; sum && e < 9; e += 3)
-                eg_accumulate(lanes, X + e * M, M, p->moments, sum + 8 * e, sum + 9 * 8 + 4 * e);
-        }
-}
-
-/* Y (3, 4) turned. */
-EG_INLINE void turn(const double *Y, double *across)
-{
-    for (int b = 0; b < 3; ++b)
-        for (int c = 0; c < 4; ++c)
-            across[4 * c + b] = Y[4 * b + c];
-}
-
-/* sum += X x moments for the nine entries of X = Ys Yt^T: Ys (3, 4), and Yt (4, 4) turned. */
-EG_INLINE void add_pair(const eg_route *route, ptrdiff_t run, ptrdiff_t stride,
-                        const double *EG_RESTRICT Ys, const double *EG_RESTRICT Yt,
-                        const double *EG_RESTRICT moments, double *EG_RESTRICT sum)
-{
-    (void)route, (void)run, (void)stride;
-    for (int a = 0; a < 3; ++a)
-        for (int b = 0; b < 3; ++b) {
-            const double x = Ys[4 * a] * Yt[b] + Ys[4 * a + 1] * Yt[4 + b]
-                             + Ys[4 * a + 2] * Yt[8 + b] + Ys[4 * a + 3] * Yt[12 + b];
-            EG_SIMD
-            for (int k = 0; k < 8; ++k)
-                sum[8 * (3 * a + b) + k] += x * moments[k];
-            EG_SIMD
-            for (int k = 0; k < 4; ++k)
-                sum[9 * 8 + 4 * (3 * a + b) + k] += x * moments[8 + k];
-        }
-}
-
-/* (F_s F_t^T) x Q Q^T: nine rows of moments a pair, row (a, b) for row a of the view with the lower
-   number. */
-static void pairs(const eg_pass *p, const eg_envelope *envelope, const double *F,
-                  double *EG_RESTRICT turned, ptrdiff_t *views, int32_t *sorted, double *sums)
-{
-    const eg_chunk *chunk = &p->chunk;
-    const ptrdiff_t M = chunk->M, L = chunk->L, lanes = alike(chunk);
-    if (lanes) {
-        add_alike(p, envelope, lanes, F, sums);
-        return;
-    }
-    for (ptrdiff_t s = 0; s < L; ++s)
-        for (ptrdiff_t j = 0; j < M && s < chunk->count[j]; ++j)
-            for (ptrdiff_t k = 0; k < 12; ++k)
-                turned[12 * (L * j + s) + k] = F[(12 * s + k) * M + j];
-    eg_add_by_view(p, envelope, 12, 1, turned, views, sorted, sums, turn, add_pair);
-}
-
 const eg_route eg_factored_route = {
     .factored = 1,
     .camera = 12,
@@ -184,5 +100,5 @@ const eg_route eg_factored_route = {
     .couple = couple,
     .to_points = to_points,
     .to_cameras = to_cameras,
-    .pairs = pairs,
+    .pairs = eg_factored_pairs,
 };

@@ -9,6 +9,7 @@ from epigauge.bundle.linearizer import Linearizer
 from epigauge.bundle.native_linearizer import NativeLinearizer
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.ties import Ties
 from epigauge.cameras import CameraModel
 from epigauge.kernels import Table
 from epigauge.two_view.losses import Loss
@@ -26,6 +27,7 @@ def linearizer_for(
     weights: Array,
     loss: Loss,
     workers: int = 1,
+    ties: Ties | None = None,
 ) -> Linearizer:
     """Return what evaluates observations of cameras of a model.
 
@@ -45,7 +47,10 @@ def linearizer_for(
         Applied to each squared residual.
     workers : int
         Threads to use where the back end can.
+    ties : Ties, optional
+        What own tangents are made of: entries of a camera's that are always zero need no work.
     """
     if kernels.compiled:
-        return NativeLinearizer(model, graph, q, weights, loss, workers)
+        used = None if ties is None else ties.used
+        return NativeLinearizer(model, graph, q, weights, loss, workers, used)
     return NumpyLinearizer(model, kernels, graph, q, weights, loss)

@@ -75,9 +75,10 @@ def bundle_problem(
     """
     retract = model.kernel("retract", kernels.name)
     how = REFINEMENT_METRIC if model.metric else REFINEMENT
+    ties = parts["freedom"].ties if "freedom" in parts else None
     return BundleProblem(
         model,
-        linearizer_for(model, kernels, graph, q, weights, loss or Loss(), workers),
+        linearizer_for(model, kernels, graph, q, weights, loss or Loss(), workers, ties),
         lambda cameras, own: np.ascontiguousarray(retract(cameras.T, own.T).T),
         refinement=how if embedded else None,
         floor=0.5 * float(np.sum(weights * (_ROUNDING * q) ** 2)),

@@ -43,6 +43,14 @@ class Ties:
     n_shared: int = 0
     C: Array | None = None
 
+    @property
+    def used(self) -> Indices | None:
+        """Return which entries of a view's own tangent any unknown moves; None for all."""
+        if self.A is None:
+            return None
+        moved = self.A.any(axis=(0, 2))
+        return np.flatnonzero(moved if self.E is None else moved | self.E.any(axis=(0, 2)))
+
     def then(self, B_cameras: Array | None, B_points: Array | None) -> Ties:
         """Return the ties of other unknowns z with x = B_cameras z and y = B_points z."""
         return replace(self, A=_product(self.A, B_cameras), C=_product(self.C, B_points))
