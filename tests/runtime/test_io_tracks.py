@@ -380,3 +380,29 @@ def test_weights_stay_with_their_observations_where_some_are_dropped(tmp_path) -
     assert len(found) == 27
     for place, weight in zip(found.xy, found.weights, strict=True):
         assert weight == by_place[tuple(place)]
+
+
+# Names and numbers of views
+
+
+@pytest.mark.parametrize("named", ["a b{}.jpg", "{}", "1{}0"])
+def test_views_may_have_names_or_any_numbers(tmp_path, named) -> None:
+    rows = zip(TRACKS.view, TRACKS.point, *TRACKS.xy.T.tolist(), strict=True)
+    lines = [f"{named.format(v)},{3 * p + 1},{x!r},{y!r}\n" for v, p, x, y in rows]
+    path = write(tmp_path / "t.csv", "view,point,x,y\n" + "".join(lines))
+    found = eg.load_tracks(path)
+    assert_same(found, TRACKS)
+    names = tuple(named.format(v) for v in range(TRACKS.n_views))
+    assert found.names == (None if named == "{}" else names)
+    eg.save_tracks(tmp_path / "again.csv", found)
+    again = eg.load_tracks(tmp_path / "again.csv")
+    assert_same(again, TRACKS)
+    assert again.names == found.names
+
+
+def test_repeated_measurements_are_pruned_when_asked(tmp_path) -> None:
+    arrays = {name: getattr(TRACKS, name) for name in ("view", "point", "xy")}
+    np.savez(tmp_path / "t.npz", **{name: np.concatenate([a, a[:1]]) for name, a in arrays.items()})
+    with pytest.raises(FileFormatError, match="twice"):
+        eg.load_tracks(tmp_path / "t.npz")
+    assert_same(eg.load_tracks(tmp_path / "t.npz", prune="first"), TRACKS)

@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import epigauge as eg
+import many_views
 import numpy as np
 import pytest
 from epigauge.errors import ArgumentError
 from metric_scenes import metric_scene
+from numpy.typing import NDArray
 
 
 def rows(n: int = 3, m: int = 8) -> dict[str, Any]:
@@ -347,3 +349,36 @@ def test_labels_that_do_not_fit_are_refused_by_name(name: str, value: object) ->
     with pytest.raises(eg.ArgumentError) as refused:
         eg.Tracks(**_twice_seen(), repeated=True, **{name: value})
     assert refused.value.argument == name
+
+
+# ---------------------------------------------------------------- a point twice in a view
+
+
+def _with_seconds() -> tuple[eg.Tracks, NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+    """Return tracks, and rows in which a wrong second measurement of five points comes first."""
+    tracks = many_views.observed(many_views.cameras_and_points(5, 60))
+    rows = np.arange(0, 50, 10)
+    view, point = (np.concatenate([a[rows], a]) for a in (tracks.view, tracks.point))
+    return tracks, view, point, np.concatenate([tracks.xy[rows] + 80.0, tracks.xy])
+
+
+@pytest.mark.parametrize("repeated", ["first", "best", "drop"])
+def test_repeated_measurements_are_pruned(repeated: str) -> None:
+    tracks, view, point, xy = _with_seconds()
+    with pytest.raises(ArgumentError, match="twice"):
+        eg.Tracks.pruned(view, point, xy)
+    found, views, points = eg.Tracks.pruned(view, point, xy, repeated=repeated)
+    assert (views.tolist(), len(points)) == (list(range(5)), 60)
+    rows = np.arange(0, 50, 10)
+    if repeated == "drop":
+        np.testing.assert_array_equal(found.xy, np.delete(tracks.xy, rows, axis=0))
+    else:
+        expected = tracks.xy.copy()
+        expected[rows] += 80.0 if repeated == "first" else 0.0
+        np.testing.assert_array_equal(found.xy, expected)
+
+
+def test_pruned_refuses_another_word() -> None:
+    _, view, point, xy = _with_seconds()
+    with pytest.raises(ArgumentError, match="repeated"):
+        eg.Tracks.pruned(view, point, xy, repeated="last")

@@ -37,10 +37,12 @@ from epigauge.io import (
     save_colmap_model,
     save_result,
 )
+from epigauge.io.output import writing
 from epigauge.io.scene_files import is_scene
 from epigauge.io.tracks import arrays_of
 from epigauge.multi_view.display import Display, display
 from epigauge.multi_view.pinhole import PinholeModel, pinhole_model
+from epigauge.verdicts import explained, usable
 
 _GAUGES = ("reference_camera", "two_cameras", "five_points", "normalized")
 #: Tracks in these files have y down, those of BAL problems y up.
@@ -49,6 +51,19 @@ _Y_DOWN = (".npz", ".csv")
 Clean = Annotated[bool, typer.Option("--clean", help="Use only what the file marks as clean.")]
 MaxIter = Annotated[int, typer.Option(help="Trial steps allowed.")]
 Backend = Annotated[str | None, typer.Option(help="c, numpy or casadi; see `epigauge info`.")]
+Init = Annotated[
+    str, typer.Option(help="Start without --start: auto, registration or factorization.")
+]
+Prune = Annotated[
+    bool,
+    typer.Option(
+        "--prune", help="Drop views and points with too few observations, and repeated ones."
+    ),
+]
+Repeated = Annotated[
+    str,
+    typer.Option(help="What --prune keeps of a point twice in a view: first, best or drop (none)."),
+]
 Start = Annotated[Path | None, typer.Option(help="NPZ or BAL with cameras and points to begin at.")]
 TracksFile = Annotated[
     Path,
@@ -70,8 +85,17 @@ def bundle(
     loss: Annotated[
         str, typer.Option(help="linear, huber, soft_l1, cauchy or truncated.")
     ] = "linear",
+    robust: Annotated[
+        bool,
+        typer.Option(
+            "--robust", help="Find gross errors, set them aside and list them (-o FILE.csv)."
+        ),
+    ] = False,
     clean: Clean = False,
+    prune: Prune = False,
+    repeated: Repeated = "first",
     max_iter: MaxIter = 100,
+    init: Init = "auto",
     start: Start = None,
     backend: Backend = None,
     plot: Annotated[
@@ -81,7 +105,10 @@ def bundle(
     output: Annotated[
         list[Path] | None,
         typer.Option(
-            "--output", "-o", help="NPZ: everything. PLY: a cloud to look at. Of scenes: any form."
+            "--output",
+            "-o",
+            help="NPZ: everything. PLY: a cloud to look at. CSV: residual of each observation, and "
+            "whether it was set aside. Of scenes: any form.",
         ),
     ] = None,
     colmap: Annotated[
@@ -124,19 +151,19 @@ def bundle(
     if refine is not None or is_scene(tracks):
         others = {"gauge": gauge, "start": start, "colmap": colmap, "clean": clean or None}
         asked = {"method": method, "damping": damping, "loss": loss, "max_iter": max_iter}
-        asked |= {"backend": backend, "gauge_mode": gauge_mode}
+        asked |= {"backend": backend, "gauge_mode": gauge_mode, "robust": robust}
         refuse_options(others)
         scene = SceneJob(tracks, refine, fix_view or [], rigs, y_up)
         return scene.run(asked, plots, outputs, json)
     for path in plots:
         check_target(path, ".png", ".svg", ".html")
     for path in outputs:
-        check_target(path, ".npz", ".ply")
+        check_target(path, ".npz", ".ply", ".csv")
     out = console()
-    file = load_track_file(tracks, clean)
+    file = load_track_file(tracks, clean, prune=repeated if prune else None)
     begin = time.perf_counter()
     with watching(out, len(file.tracks), "first reconstruction", not json) as watch:
-        first = first_reconstruction(file, tracks, start, backend)
+        first = first_reconstruction(file, tracks, start, backend, init, robust)
         watch.begin()
         result = eg.bundle_adjust(
             file.tracks,
@@ -145,6 +172,7 @@ def bundle(
             damping=damping,
             gauge=gauge_named(gauge),
             gauge_mode=gauge_mode,
+            robust=robust,
             loss=loss,
             max_iter=max_iter,
             backend=backend,
@@ -175,12 +203,17 @@ def bundle(
 
 
 def first_reconstruction(
-    file: TrackFile, tracks: Path, start: Path | None, backend: str | None
+    file: TrackFile,
+    tracks: Path,
+    start: Path | None,
+    backend: str | None,
+    init: str = "auto",
+    robust: bool = False,
 ) -> eg.Reconstruction:
     """Return where to begin: what a file holds, or else two views and the others in turn."""
     if start is None:
         try:
-            return eg.initialize(file.tracks, backend=backend)
+            return eg.initialize(file.tracks, method=init, robust=robust, backend=backend)
         except ArgumentError as error:
             if error.argument == "tracks":
                 raise FileFormatError(tracks, str(error)) from None
@@ -247,9 +280,28 @@ class _Answer:
         if path.suffix.lower() == ".npz":
             save_result(path, self.result, **arrays_of(self.file.tracks), **self.more())
             return
+        if path.suffix.lower() == ".csv":
+            self.save_table(path)
+            return
         frame = self.frame
         note = "points blue, cameras orange; a basis to look at, not a calibration"
         save_cloud(path, frame.points[frame.shown], frame.centres, note)
+
+    def save_table(self, path: Path) -> None:
+        """Write each observation, its residual and whether it was set aside, as CSV."""
+        result, file = self.result, self.file
+        names = file.tracks.names or tuple(map(str, file.views.tolist()))
+        columns = (
+            [names[k] for k in file.tracks.view.tolist()],
+            file.points[file.tracks.point].tolist(),
+            *file.tracks.xy.T.tolist(),
+            *result.fun.T.tolist(),
+            result.rejected.astype(int).tolist(),
+        )
+        with writing(path) as stream:
+            stream.write(b"view,point,x,y,residual_x,residual_y,rejected\n")
+            for row in zip(*columns, strict=True):
+                stream.write((",".join(map(str, row)) + "\n").encode())
 
     def draw(self, path: Path) -> None:
         """Draw a picture, or write a page."""
@@ -289,6 +341,11 @@ class _Answer:
             "status": "interrupted" if interrupted else escape(result.message),
             "seconds": f"{self.seconds:.2f}",
         }
+        if result.flags:
+            rows["flags"] = ", ".join(result.flags)
+        if result.rejected.any():
+            count = int(np.count_nonzero(result.rejected))
+            rows["set aside"] = f"{count} of {len(tracks)} observations, as gross errors"
         if result.loss_scale_px:
             rows["loss_scale_px"] = f"{result.loss_scale_px:.4g}"
         if self.model is not None:
@@ -298,5 +355,8 @@ class _Answer:
                 "left out; a start for `colmap bundle_adjuster`, no calibration"
             )
         out.print(facts(escape(shown(self.source)), rows))
-        if not (result.success or interrupted):
+        for name, text in explained(result.flags).items():
+            style = "bold yellow" if usable([name], "views") else "bold red"
+            out.print(f"[{style}]{name}:[/] {escape(text)}")
+        if result.status <= 0 and not interrupted:
             out.print(f"[bold red]did not converge:[/] {escape(result.message)}")

@@ -29,7 +29,10 @@ from epigauge.cli._scenes import FixView, Refine, SceneJob, refuse_options
 from epigauge.cli.bundle import (
     Backend,
     Clean,
+    Init,
     MaxIter,
+    Prune,
+    Repeated,
     Start,
     TracksFile,
     first_reconstruction,
@@ -45,7 +48,10 @@ def compare(
         str, typer.Option(help="all, or several of: " + ", ".join(STRATEGIES) + ".")
     ] = "all",
     clean: Clean = False,
+    prune: Prune = False,
+    repeated: Repeated = "first",
     max_iter: MaxIter = 100,
+    init: Init = "auto",
     start: Start = None,
     backend: Backend = None,
     plot: Annotated[Path | None, typer.Option(help="Draw the convergence: PNG or SVG.")] = None,
@@ -71,7 +77,7 @@ def compare(
         refuse_options({"clean": clean or None, "start": start})
         observed = SceneJob(tracks, refine, fix_view or [])
     else:
-        observed = load_track_file(tracks, clean)
+        observed = load_track_file(tracks, clean, prune=repeated if prune else None)
     chosen = methods if methods == "all" else [name.strip() for name in methods.split(",")]
     with watching(out, len(observed.tracks), "first reconstruction", not json) as watch:
         options: dict[str, Any] = {"max_iter": max_iter, "backend": backend}
@@ -79,7 +85,7 @@ def compare(
             options |= {"refine": observed.refine, "fixed_views": observed.fixed}
             first: Any = observed.start
         else:
-            first = first_reconstruction(observed, tracks, start, backend)
+            first = first_reconstruction(observed, tracks, start, backend, init)
         comparison = eg.compare(
             observed.tracks, chosen, first, on_method=watch.begin, callback=watch, **options
         )
@@ -129,7 +135,7 @@ def print_table(out: Console, comparison: Comparison, title: str) -> None:
             f"{row.rms_px:.6f}",
             f"{row.cost:.8g}",
             f"{row.seconds:.3f}",
-            "yes" if row.success else "no",
+            "yes" if row.success else ", ".join(row.flags) or "no",
             style=style if row.success else "red",
         )
     out.print(table)

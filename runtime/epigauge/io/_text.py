@@ -34,6 +34,9 @@ class Columns:
         Optional columns of numbers.
     flags : tuple of str
         Optional columns of marks, 0 or 1.
+    labels : tuple of str
+        Those of the indices that may be names instead, such as those of files: they are numbered as
+        they come, and found under the column's name and ``_names``.
     """
 
     what: str
@@ -41,6 +44,7 @@ class Columns:
     indices: tuple[str, ...] = ()
     numbers: tuple[str, ...] = ("weight",)
     flags: tuple[str, ...] = ()
+    labels: tuple[str, ...] = ()
 
     @property
     def known(self) -> tuple[str, ...]:
@@ -79,6 +83,7 @@ def read_text(
     separator: str | None = None
     flag_at: int | None = None
     values, flags = array.array("d"), bytearray()
+    codes: dict[str, dict[str, str]] = {}
     for line, text, comment in text_lines(path, file):
         if not text:
             fields = _split(comment, _separator(comment))
@@ -103,6 +108,11 @@ def read_text(
             continue
         if len(values) >= MAX_MATCHES * len(wanted):
             raise FileFormatError(path, f"holds more than {MAX_MATCHES} {columns.what}", line)
+        if not values:
+            codes = {n: {} for n in columns.labels if not _is_number(fields[wanted[n]])}
+        for name, known in codes.items():
+            field = fields[wanted[name]]
+            fields[wanted[name]] = known.setdefault(field, str(len(known)))
         row = numbers(path, [fields[column] for column in wanted.values()], line)
         for name, value in zip(columns.indices, row, strict=False):
             _check_index(path, name, value, line)
@@ -114,6 +124,7 @@ def read_text(
     table = np.array(values).reshape(-1, len(wanted))
     found: dict[str, Any] = dict(zip(wanted, table.T, strict=True))
     found |= {name: found[name].astype(np.intp) for name in columns.indices}
+    found |= {f"{name}_names": list(known) for name, known in codes.items()}
     if flag is not None and flag_at is not None:
         found[flag] = np.frombuffer(flags, dtype=np.bool_)
     return found

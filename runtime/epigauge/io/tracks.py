@@ -19,13 +19,18 @@ from epigauge.io._common import MAX_MATCHES, PathLike, check_suffix, listed
 from epigauge.io._npz import read_npz, write_npz
 from epigauge.io._text import Columns, read_text
 from epigauge.io.output import writing
+from epigauge.multi_view.labels import view_names
 from epigauge.multi_view.tracks import Reconstruction, Tracks
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 _COLUMNS = Columns(
-    "observations", ("view", "point", "x", "y"), indices=("view", "point"), flags=("clean",)
+    "observations",
+    ("view", "point", "x", "y"),
+    indices=("view", "point"),
+    flags=("clean",),
+    labels=("view",),
 )
 _TRACKS = ("view", "point", "xy")
 _SUFFIXES = (".npz", ".csv", ".txt", ".txt.bz2", ".txt.gz")
@@ -51,13 +56,22 @@ class TrackFile:
     points: Indices
 
 
-def load_tracks(path: PathLike, clean: bool = False, views: Iterable[int] | None = None) -> Tracks:
+def load_tracks(
+    path: PathLike,
+    clean: bool = False,
+    views: Iterable[int] | None = None,
+    *,
+    prune: str | None = None,
+) -> Tracks:
     """Read tracks from an NPZ, CSV or BAL file.
 
     NPZ: arrays ``view``, ``point`` (N,) and ``xy`` (N, 2); optionally ``weights`` (N,), ``clean``
     (one mark a point), ``n_views`` and ``n_points``. CSV: columns view, point, x, y, or a first
     line with the names of the columns: these in any order, optionally ``weight`` and ``clean``
-    (one mark an observation). BAL (``.txt``, ``.txt.bz2``, ``.txt.gz``): the observations.
+    (one mark an observation). Views may have names, such as those of files, in place of numbers,
+    and are then sorted by them; numbers may begin anywhere and have gaps: both are kept in
+    ``tracks.names``.
+    BAL (``.txt``, ``.txt.bz2``, ``.txt.gz``): the observations.
 
     Parameters
     ----------
@@ -67,6 +81,9 @@ def load_tracks(path: PathLike, clean: bool = False, views: Iterable[int] | None
         Keep only what the file marks as clean.
     views : iterable of int, optional
         Keep only these views.
+    prune : {"first", "best", "drop"}, optional
+        Drop views and points with too few observations, and of a point measured several times in
+        one view keep the first, the best or none, as `Tracks.pruned` does.
 
     Returns
     -------
@@ -81,7 +98,7 @@ def load_tracks(path: PathLike, clean: bool = False, views: Iterable[int] | None
     OSError
         If the file cannot be read.
     """
-    return load_track_file(path, clean, views, with_start=False).tracks
+    return load_track_file(path, clean, views, prune=prune, with_start=False).tracks
 
 
 def load_track_file(
@@ -89,6 +106,7 @@ def load_track_file(
     clean: bool = False,
     views: Iterable[int] | None = None,
     *,
+    prune: str | None = None,
     with_start: bool = True,
 ) -> TrackFile:
     """Read tracks, the reconstruction that comes with them, and the numbers they had in the file.
@@ -101,6 +119,9 @@ def load_track_file(
         Keep only what the file marks as clean.
     views : iterable of int, optional
         Keep only these views.
+    prune : {"first", "best", "drop"}, optional
+        Drop views and points with too few observations, and of a point measured several times in
+        one view keep the first, the best or none, as `Tracks.pruned` does.
     with_start : bool
         Read the reconstruction too, where there is one.
 
@@ -123,24 +144,51 @@ def load_track_file(
     start = _reconstruction(path, found)
     weights = found.get("weights")
     try:
-        if keep is None:
-            n_views, n_points = (_count(path, f"n_{name}s", found) for name in ("view", "point"))
-            tracks = Tracks(view, point, xy, n_views, n_points, weights)
-            old_views, old_points = np.arange(tracks.n_views), np.arange(tracks.n_points)
+        if keep is None and prune is None:
+            tracks, old_views, old_points = _renumbered(path, found, view, point, xy, weights)
         else:
-            if weights is not None and weights.shape == keep.shape:
-                weights = weights[keep]
+            rows = slice(None) if keep is None else keep
+            if weights is not None and weights.shape == view.shape:
+                weights = weights[rows]
             tracks, old_views, old_points = Tracks.pruned(
-                view[keep], point[keep], xy[keep], weights
+                view[rows], point[rows], xy[rows], weights, repeated=prune
             )
     except ArgumentError as error:
         raise FileFormatError(path, str(error)) from None
+    tracks.names = _names(path, found, old_views, tracks.names)
     if start is not None:
         if len(start.P) <= old_views[-1] or len(start.Q) <= old_points[-1]:
             reason = f"has {len(start.P)} cameras and {len(start.Q)} points but tracks of more"
             raise FileFormatError(path, reason)
         start = Reconstruction(start.P[old_views], start.Q[old_points])
     return TrackFile(tracks, start, old_views, old_points)
+
+
+def _renumbered(
+    path: Path, found: dict[str, Any], view: Indices, point: Indices, xy: Array, weights: Any
+) -> tuple[Tracks, Indices, Indices]:
+    """Return the tracks of a file, numbered from 0 without gaps, and the numbers in the file."""
+    old_views, views = np.unique(view, return_inverse=True)
+    old_points, points = np.unique(point, return_inverse=True)
+    n_views, n_points = (_count(path, f"n_{name}s", found) for name in ("view", "point"))
+    # A number that says how many there are is checked, unless there are gaps.
+    n_views = n_views if old_views[-1] == len(old_views) - 1 else None
+    n_points = n_points if old_points[-1] == len(old_points) - 1 else None
+    return Tracks(views, points, xy, n_views, n_points, weights), old_views, old_points
+
+
+def _names(
+    path: Path, found: dict[str, Any], old_views: Indices, names: tuple[str, ...] | None
+) -> tuple[str, ...] | None:
+    """Return what the file calls the views: by name, or by numbers other than ours."""
+    if "names" in found:
+        given = found["names"]
+        if len(given) <= old_views[-1]:
+            raise FileFormatError(path, f"holds {len(given)} names, needed: one a view")
+        return view_names([given[k] for k in old_views.tolist()], len(old_views))
+    if (old_views != np.arange(len(old_views))).any():
+        return tuple(map(str, old_views.tolist()))
+    return names
 
 
 def load_reconstruction(path: PathLike) -> Reconstruction:
@@ -263,6 +311,11 @@ def _read(path: Path, with_start: bool) -> dict[str, Any]:
             found = {"view": columns["view"], "point": columns["point"]}
             found["xy"] = np.column_stack([columns["x"], columns["y"]])
             found |= {"weights": columns["weight"]} if "weight" in columns else {}
+            if "view_names" in columns:  # numbered by their order, whatever that of the rows
+                names = columns["view_names"]
+                found["names"] = sorted(names)
+                rank = {name: k for k, name in enumerate(found["names"])}
+                found["view"] = np.array([rank[name] for name in names])[found["view"]]
             return found | ({"clean_rows": columns["clean"]} if "clean" in columns else {})
         with decompressing(file, form) as stream:
             problem = read_bal(path, stream)
@@ -345,12 +398,18 @@ def _count(path: Path, name: str, found: dict[str, Any]) -> int | None:
 
 def _write_csv(file: IO[bytes], tracks: Tracks) -> None:
     arrays = arrays_of(tracks)
+    views = tracks.view if tracks.names is None else np.array(tracks.names)[tracks.view]
     head = ["view", "point", "x", "y", *(["weight"] if "weights" in arrays else [])]
-    columns = [tracks.view, tracks.point, *tracks.xy.T]
+    columns = [views, tracks.point, *tracks.xy.T]
     columns += [arrays["weights"]] if "weights" in arrays else []
     file.write((",".join(head) + "\n").encode())
     for row in zip(*(column.tolist() for column in columns), strict=True):
-        file.write((",".join(map(repr, row)) + "\n").encode())
+        file.write((",".join(map(_written, row)) + "\n").encode())
+
+
+def _written(value: object) -> str:
+    """Return a field of a table."""
+    return value if isinstance(value, str) else repr(value)
 
 
 def decompressing(file: IO[bytes], form: str) -> AbstractContextManager[Any]:

@@ -40,6 +40,7 @@ class ComparedMethod:
     seconds: float
     status: int
     success: bool
+    flags: tuple[str, ...]
     message: str
     history: tuple[lm.Row, ...] = field(repr=False)
 
@@ -152,6 +153,7 @@ def compare(
                 seconds,
                 result.status,
                 result.success,
+                result.flags,
                 result.message,
                 result.history,
             )

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epigauge._arguments import MAX_PX, MIN_PX, as_array, as_double, as_weights
+from epigauge._arguments import MAX_PX, MIN_PX, as_array, as_choice, as_double, as_weights
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.labels import image_sizes, point_colours, view_names
 
@@ -123,7 +123,13 @@ class Tracks:
 
     @classmethod
     def pruned(
-        cls, view: ArrayLike, point: ArrayLike, xy: ArrayLike, weights: ArrayLike | None = None
+        cls,
+        view: ArrayLike,
+        point: ArrayLike,
+        xy: ArrayLike,
+        weights: ArrayLike | None = None,
+        *,
+        repeated: str | None = None,
     ) -> tuple[Tracks, Indices, Indices]:
         """Drop views and points with too few observations and renumber the rest.
 
@@ -131,6 +137,11 @@ class Tracks:
         ----------
         view, point, xy, weights : array_like
             As for the constructor, with gaps allowed.
+        repeated : {"first", "best", "drop"}, optional
+            Of a point measured several times in one view, keep the first measurement, the one
+            nearest to where the point's other views put it (by a reconstruction without the
+            repeated ones; the first where that knows no such point), or none. By default such a
+            pair is refused. Which rows are left: `order` of the tracks refers to the rows kept.
 
         Returns
         -------
@@ -138,6 +149,11 @@ class Tracks:
             What is left.
         views, points : ndarray of int
             Old numbers of the views and points left.
+
+        Raises
+        ------
+        ArgumentError
+            As the constructor, of what is left.
         """
         views, points = _indices("view", view), _indices("point", point)
         pixels = as_array("xy", xy, "an (N, 2) array")
@@ -146,10 +162,15 @@ class Tracks:
         if len(set(lengths)) > 1:
             have = "have {}, {} and {} rows".format(*lengths)
             raise ArgumentError("view, point, xy", have, "one row an observation")
+        keep = np.ones(len(views), dtype=np.bool_)
+        if repeated is not None:
+            as_choice("repeated", repeated, ("first", "best", "drop"))
+            keep = _once(views, points, repeated)
+            if repeated == "best" and not keep.all():
+                keep = _nearest(views, points, pixels, w, keep)
         # Without gaps first: what is counted below has one entry a number.
         all_views, views = np.unique(views, return_inverse=True)
         all_points, points = np.unique(points, return_inverse=True)
-        keep = np.ones(len(views), dtype=np.bool_)
         while keep.any():
             per_view, per_point = np.bincount(views[keep]), np.bincount(points[keep])
             strong = keep.copy()
@@ -274,6 +295,39 @@ class Tracks:
             if (spread == label).all():
                 return np.unique(label, return_inverse=True)[1]
             label = spread
+
+
+def _once(view: Indices, point: Indices, repeated: str) -> NDArray[np.bool_]:
+    """Return the first row of each point in each view; with "drop", those that are alone."""
+    order = np.lexsort((view, point))
+    new = (np.diff(point[order], prepend=-1) != 0) | (np.diff(view[order], prepend=-1) != 0)
+    if repeated == "drop":
+        new &= np.append(new[1:], True)
+    keep = np.zeros(len(view), dtype=np.bool_)
+    keep[order[new]] = True
+    return keep
+
+
+def _nearest(
+    view: Indices, point: Indices, xy: Array, weights: Array, keep: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return the rows to keep, of repeated ones those nearest to a reconstruction without them."""
+    from epigauge.multi_view.initialize import initialize
+
+    alone = _once(view, point, "drop")
+    tracks, views, points = Tracks.pruned(view[alone], point[alone], xy[alone], weights[alone])
+    found = initialize(tracks, robust=True)
+    rows = np.flatnonzero(~alone & np.isin(view, views) & np.isin(point, points))
+    i, j = np.searchsorted(views, view[rows]), np.searchsorted(points, point[rows])
+    h = np.einsum("nij,nj->ni", found.P[i], found.Q[j])
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        away = np.linalg.norm(h[:, :2] / h[:, 2:] - xy[rows], axis=1)
+    order = np.lexsort((np.nan_to_num(away, nan=np.inf), view[rows], point[rows]))
+    rows = rows[order]
+    new = (np.diff(point[rows], prepend=-1) != 0) | (np.diff(view[rows], prepend=-1) != 0)
+    kept = keep.copy()
+    kept[rows] = new
+    return kept
 
 
 @dataclass(frozen=True)
