@@ -7,6 +7,8 @@ loss.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,8 +32,9 @@ Mask = NDArray[np.bool_]
 #: Cameras are proposed from so many points, each size so often, and judged by so many points.
 _SIZES, _DRAWS, _JUDGES = (6, 8, 12), 120, 500
 
-#: Standard deviations of matches, as shares of the extent of the images, that a search begins with.
-_SIGMAS = (0.1, 0.01, 0.001)
+#: Standard deviations of matches, in coordinates of RMS two, that a search begins with, and the one
+#: that subsets of all matches are judged by.
+_SIGMAS, _ROUGH = (0.03, 0.003), 0.01
 
 #: A match agrees within so many standard deviations.
 _AGREES = 4.0
@@ -65,8 +68,12 @@ def agreed_fundamental(kernels: Table, x1: Array, x2: Array) -> tuple[Array, Mas
     frame = condition(x1, x2)
     consensus = Consensus(kernels, *frame.forward(x1, x2))
     F = consensus.linear_fits(np.ones((1, consensus.products.shape[1])))[0]
-    starts = [consensus.judge(F, sigma) for sigma in _SIGMAS]
-    found = consensus.search(starts, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    rough = replace(consensus.judge(F, _ROUGH), sigma=_ROUGH, share=0.5)
+    everything = np.arange(consensus.products.shape[1])
+    drawn = consensus.promising(consensus.subset_fits(everything, rng), rough)
+    starts = [consensus.judge(one, sigma) for one in (F, *drawn) for sigma in _SIGMAS]
+    found = consensus.search(starts, rng)
     agrees = found.inliers(_AGREES * max(found.sigma, 1e-9))
     if np.count_nonzero(agrees) < 8:
         raise ArgumentError("x1, x2", "agree on no epipolar geometry", "matches that do")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 
@@ -265,7 +266,8 @@ class _Builder:
         try:
             F, agrees = None, np.ones(len(points), dtype=np.bool_)
             if self.robust:
-                F, agrees = agreed_fundamental(self.kernels, x1, x2)
+                with suppress(ArgumentError):  # then the loss alone has to do
+                    F, agrees = agreed_fundamental(self.kernels, x1, x2)
             result = refine_fundamental(
                 x1[agrees],
                 x2[agrees],
