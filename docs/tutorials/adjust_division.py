@@ -5,18 +5,18 @@ import numpy as np
 
 rng = np.random.default_rng(0)
 n, m = 6, 50
-turns = rng.uniform(-0.4, 0.4, (n, 3))
-R = np.array([np.linalg.qr(np.eye(3) + np.cross(np.eye(3), w))[0] for w in turns])
-R *= np.linalg.det(R)[:, None, None]
+turns = rng.uniform(-0.4, 0.4, n)
+R = np.array([[[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]] for a in turns])
 t = np.column_stack([rng.uniform(-0.5, 0.5, (n, 2)), np.full(n, 5.0)])
 X = rng.uniform(-1.0, 1.0, (m, 3)) * [1.5, 1.0, 1.0]
 cameras = eg.Cameras("division", [[800.0, 640.0, 480.0, -0.2]], np.zeros(n, int))
-truth = eg.MetricReconstruction(R * np.sign(R[:, :1, :1]), t, X, cameras)
+truth = eg.MetricReconstruction(R, t, X, cameras)
 
 view, point = np.divmod(np.arange(n * m), m)
-tracks = eg.Tracks(view, point, truth.project(eg.Tracks(view, point, np.zeros((n * m, 2)))))
+blank = eg.Tracks(view, point, np.zeros((n * m, 2)))  # sorts by point
+tracks = eg.Tracks(blank.view, blank.point, truth.project(blank))
 start = eg.MetricReconstruction(
-    truth.R,
+    R,
     t + 0.05 * rng.standard_normal((n, 3)),
     X + 0.05 * rng.standard_normal((m, 3)),
     eg.Cameras("division", [[780.0, 640.0, 480.0, 0.0]], cameras.camera_of_view),
