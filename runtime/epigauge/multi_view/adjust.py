@@ -16,6 +16,7 @@ from epigauge.bundle.dampings import DAMPINGS
 from epigauge.bundle.jobs import metric_job, projective_job
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.priors import Prior
+from epigauge.bundle.refinement import fixed_indices
 from epigauge.bundle.run import checked_gauge, minimized
 from epigauge.bundle.strategies import STRATEGIES
 from epigauge.cameras import MetricReconstruction
@@ -65,6 +66,13 @@ class BundleResult:
         the camera's formula gives.
     rejected : ndarray of bool, shape (N,)
         Observations that were set aside as gross errors, in the order of the tracks.
+    condition : float
+        Of metric cameras, beside the gauge: inverse of the least eigenvalue of the reduced normal
+        matrix scaled to a unit diagonal; infinite where something is undetermined, NaN where the
+        system was not factored, and for projective cameras.
+    weakest : str
+        The direction of that eigenvalue: its three largest standard deviations, as shares of a
+        radian, of the scene's size, or of the focal length.
     nfev, njev, nit, status, message, success, history
         As in `FundamentalResult`.
     """
@@ -79,6 +87,8 @@ class BundleResult:
     rank: int
     n_behind: int
     rejected: NDArray[np.bool_] = field(repr=False)
+    condition: float
+    weakest: str
     nfev: int
     njev: int
     nit: int
@@ -242,6 +252,7 @@ def bundle_adjust(
     workers = as_count("workers", workers)
     stopping = lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter)
     table = kernels.table(backend)
+    fixed_views, fixed_points = tuple(fixed_views), tuple(fixed_points)
     of_metric: dict[str, Any] = {
         "refine": refine,
         "fixed_views": fixed_views,
@@ -273,7 +284,11 @@ def bundle_adjust(
     reconstruction = job.result(cameras, points)
     rejected = np.zeros(len(tracks), dtype=np.bool_)
     if isinstance(reconstruction, MetricReconstruction):
-        verdict = judged_metric(tracks, reconstruction, outcome)
+        fixed = np.zeros(tracks.n_points, dtype=np.bool_)
+        fixed[fixed_indices("fixed_points", fixed_points, tracks.n_points)] = True
+        reference = bool(STRATEGIES[method].reference)
+        parts = table, fixed, job.fixes_gauge or reference
+        verdict = judged_metric(tracks, reconstruction, outcome, *parts)
     else:
         verdict = judged(tracks, reconstruction, rejected, loss == "linear", table, workers)
     unit = job.scale_px**2
@@ -302,6 +317,8 @@ def _result(
         flags=verdict.flags,
         rank=verdict.rank,
         n_behind=verdict.n_behind,
+        condition=verdict.condition,
+        weakest=verdict.weakest,
         rejected=rejected,
         nfev=outcome.nfev,
         njev=outcome.njev,

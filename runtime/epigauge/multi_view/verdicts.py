@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from epigauge import lm
 from epigauge.bundle.dampings import Covariant
+from epigauge.bundle.diagnosis import diagnosed
 from epigauge.bundle.null_space import generators
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.problem import BundleState, Estimate
@@ -70,6 +71,9 @@ _BEYOND = 0.2
 #: Share of single points that may be open without the rest being called undetermined.
 _OPEN = 0.05
 
+#: Share of its size that a metric quantity may be uncertain by before that is told.
+_UNCERTAIN = 0.1
+
 #: Share of the observations that may lie behind a camera before it is told: chance, and far points.
 BEHIND = 0.01
 
@@ -87,11 +91,15 @@ class Verdict:
         views and points that count, these with two observations.
     n_behind : int
         Observations of points behind the camera, signs of cameras and points being chosen best.
+    condition, weakest : float, str
+        Of metric cameras: see `BundleResult`.
     """
 
     flags: tuple[str, ...]
     rank: int
     n_behind: int
+    condition: float = float("nan")
+    weakest: str = ""
 
 
 def judged(
@@ -158,7 +166,12 @@ def judged(
 
 
 def judged_metric(
-    tracks: Tracks, found: MetricReconstruction, outcome: lm.Outcome[BundleState]
+    tracks: Tracks,
+    found: MetricReconstruction,
+    outcome: lm.Outcome[BundleState],
+    kernels: Table,
+    known: Mask,
+    fixes_gauge: bool,
 ) -> Verdict:
     """Judge an adjusted metric reconstruction.
 
@@ -170,18 +183,60 @@ def judged_metric(
         Cameras and points, at the minimum.
     outcome : Outcome
         How the minimisation ended.
+    kernels : Table
+        Back end.
+    known : ndarray of bool, shape (m,)
+        Points that are fixed.
+    fixes_gauge : bool
+        Whether anything fixed or known ties the reconstruction to its frame.
 
     Returns
     -------
     Verdict
-        Flags, rank, and the number of observations that are not in front of their camera.
+        Flags, rank, condition and weakest direction, and the number of observations that are not in
+        front of their camera.
     """
     n_behind = int(np.count_nonzero(~(found.depths(tracks) > 0.0)))
     raised = ["behind the cameras"] if n_behind > BEHIND * len(tracks) else []
-    system = outcome.system
-    assert isinstance(system, BundleSystem)
-    unknowns = sum(part.size for part in system.gradients)
-    return Verdict(ordered(raised), unknowns - system.model.gauge_dimension, n_behind)
+    system, rank = outcome.system, 0
+    condition, weakest = float("nan"), ""
+    if isinstance(system, BundleSystem) and np.isfinite(outcome.state.cost):
+        diagnosis = diagnosed(system, kernels, known, fixes_gauge)
+        rank, condition = diagnosis.rank, diagnosis.condition
+        counted = 2 * int(np.count_nonzero(tracks.weights)) - rank
+        noise_px = np.sqrt(2.0 * outcome.state.cost / max(counted, 1))
+        deviations = noise_px * np.abs(diagnosis.cameras)
+        weakest, share = _named(system, deviations)
+        if diagnosis.missing:
+            raised.append("undetermined")
+        elif share > _UNCERTAIN:
+            raised.append("weak geometry")
+    return Verdict(ordered(raised), rank, n_behind, condition, weakest)
+
+
+def _named(system: BundleSystem, deviations: Array) -> tuple[str, float]:
+    """Return the largest standard deviations of a direction by name, as shares of their sizes.
+
+    Turns are in radians, moves as shares of the median distance of the points, focal lengths and
+    other parameters in pixels as shares of the focal length; those without unit count for nothing.
+    """
+    model, cameras = system.model, system.cameras
+    pose = cameras[:, :12].reshape(-1, 3, 4)
+    centres = -np.einsum("nji,nj->ni", pose[:, :, :3], pose[:, :, 3])
+    extent = np.median(np.linalg.norm(system.points - centres.mean(axis=0), axis=1))
+    sizes = np.ones(deviations.shape)
+    sizes[:, 3:6] = max(float(extent), 1e-300)
+    focal = cameras[:, 12:][:, list(model.focal)]
+    sizes[:, 6:] = focal.mean(axis=1, keepdims=True) if focal.size else np.inf
+    without = [k for k, unit in enumerate(model.units) if unit != "px"]
+    sizes[:, [6 + k for k in without]] = np.inf
+    shares = deviations / sizes
+    views, entries = np.unravel_index(np.argsort(-shares, axis=None)[:3], shares.shape)
+    told = [
+        f"{model.tangent_names[k]} of view {i} ({100.0 * shares[i, k]:.2g} %)"
+        for i, k in zip(views, entries, strict=True)
+    ]
+    return ", ".join(told), float(shares.max())
 
 
 def missing_by_count(seen: Seen) -> int:

@@ -1,0 +1,130 @@
+"""How well the observations determine what was adjusted: rank, and the weakest direction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.bundle.dampings import Covariant
+from epigauge.bundle.null_space import generators
+from epigauge.bundle.solve import BundleSystem, reduced_system
+from epigauge.bundle.ties import congruent
+from epigauge.kernels import Table
+
+__all__ = ["Diagnosis", "diagnosed"]
+
+Array = NDArray[np.float64]
+
+#: An eigenvalue below this, where the diagonal is one, is rounding; the shift that is factored.
+_ROUNDING, _SHIFT = 1e-11, 1e-12
+
+#: A motion of the gauge is held that resists more than this, of the one that resists most.
+_HELD = 1e-9
+
+#: Columns beside the gauge, and steps, of the inverse iteration.
+_COLUMNS, _ITERATIONS = 4, 4
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What the normal matrix says.
+
+    Attributes
+    ----------
+    rank : int
+        Of the normal matrix of the unknowns.
+    missing : int
+        Directions of the cameras that no observation or prior determines, beside the gauge. Those
+        of single points lower the rank, and spoil nothing else.
+    condition : float
+        Inverse of the least eigenvalue, beside those and the gauge, of the reduced system of the
+        cameras with unit diagonal blocks; NaN where the system is not factored.
+    cameras : ndarray, shape (n, d)
+        Own tangents of that weakest direction, one standard deviation long for a noise of one.
+    """
+
+    rank: int
+    missing: int
+    condition: float
+    cameras: Array
+
+
+def diagnosed(
+    system: BundleSystem, kernels: Table, known: NDArray[np.bool_], fixes_gauge: bool
+) -> Diagnosis:
+    """Diagnose the normal equations at an estimate.
+
+    Parameters
+    ----------
+    system : BundleSystem
+        The normal equations; metric cameras.
+    kernels : Table
+        Back end.
+    known : ndarray of bool, shape (m,)
+        Points that are fixed: they are no unknowns.
+    fixes_gauge : bool
+        Whether anything is fixed or known that ties the frame; else all of the gauge is free.
+    """
+    n, d = system.normal.g_cameras.shape
+    W = Covariant().blocks(system)
+    whitening = np.linalg.inv(np.swapaxes(np.linalg.cholesky(W.cameras), 1, 2))
+    ties = system.ties.then(whitening, None).scaled(1.0 / np.sqrt(W.shared))
+    size = np.einsum("mii->mi", W.points)
+    least = np.linalg.eigvalsh(system.V / np.sqrt(size[:, :, None] * size[:, None, :]))
+    free = ~known
+    of_points = int(np.count_nonzero(least[free] <= _ROUNDING))
+    T, _ = system.inverse_roots(system.V, W.points, _SHIFT, system.gradients[2])
+    white = congruent(ties.A, system.normal.U)
+    a, r = white.shape[1], ties.n_shared
+    frozen = 0 if system.ties.A is None else int(np.count_nonzero(~system.ties.A.any(axis=1)))
+    unknowns = n * a - frozen + r + 3 * int(np.count_nonzero(free))
+    gauge = _free_gauge(system, kernels) if fixes_gauge else system.model.gauge_dimension
+    nothing = np.zeros((n, d))
+    if not system.normal.coupling.direct:
+        return Diagnosis(unknowns - gauge - of_points, 0, float("nan"), nothing)
+    parts = system.normal, ties, system.own_roots(T), None
+    shifted, _ = reduced_system(*parts, white + _SHIFT * np.eye(a), _SHIFT)
+    count = min(gauge + _COLUMNS, n * a - frozen + r)
+    X = np.random.default_rng(0).standard_normal((n * a + r, count))
+    for _ in range(_ITERATIONS):
+        X = np.linalg.qr(X)[0]
+        x, s = shifted.solve(X[: n * a].reshape(n, a, count), X[n * a :])
+        Y = np.concatenate([x.reshape(n * a, count), s])
+        inverse, turn = np.linalg.eigh(0.5 * (X.T @ Y + Y.T @ X))
+        X = Y @ turn
+    values = (1.0 / np.maximum(inverse, 1e-300) - _SHIFT)[::-1]
+    X = X[:, ::-1] / np.linalg.norm(X[:, ::-1], axis=0)
+    open_ = int(np.count_nonzero(values <= _ROUNDING))
+    missing = max(open_ - gauge, 0)
+    rank = unknowns - gauge - missing - of_points
+    first = max(open_, gauge)
+    if first >= count:
+        return Diagnosis(rank, missing, float("inf"), nothing)
+    value = float(max(values[first], _ROUNDING))
+    x, s = X[: n * a, first].reshape(n, a, 1), X[n * a :, first, None]
+    weakest = ties.cameras(x, s)[..., 0] / np.sqrt(value)
+    return Diagnosis(rank, missing, 1.0 / value, weakest)
+
+
+def _free_gauge(system: BundleSystem, kernels: Table) -> int:
+    """Return the dimension of the gauge that what is fixed and known leaves.
+
+    A motion of the gauge is free where the unknowns can make it and no prior resists.
+    """
+    cameras, points = generators(system.model, kernels, system.cameras, system.points)
+    g, ties = cameras.shape[2], system.ties
+    size = np.sqrt(np.sum(cameras**2, axis=(0, 1)) + np.sum(points**2, axis=(0, 1)))
+    cameras, points = cameras / size, points / size
+    held = np.zeros((g, g))
+    for own, basis in ((cameras, ties.A), (points, ties.C)):
+        if basis is not None:
+            stuck = (own - basis @ (np.linalg.pinv(basis) @ own)).reshape(-1, g)
+            held += stuck.T @ stuck
+    for k in range(g):  # of J^T J only what priors add is left
+        x, y = system.product(cameras[..., k], points[..., k])
+        along = np.einsum("ndg,nd->g", cameras, x) + np.einsum("mbg,mb->g", points, y)
+        held[k] += along / system.largest()
+    values = np.linalg.eigvalsh(0.5 * (held + held.T))
+    return int(np.count_nonzero(values <= _HELD * max(values[-1], 1.0 / len(system.cameras))))

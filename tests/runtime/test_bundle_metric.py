@@ -1,0 +1,368 @@
+"""Bundle adjustment of metric cameras: ties, priors, invariance, optima."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import epigauge as eg
+import many_views
+import numpy as np
+import pytest
+from epigauge import kernels
+from epigauge.bundle.dampings import Covariant
+from epigauge.bundle.jobs import metric_job
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.problem import BundleProblem, BundleState, Estimate
+from epigauge.bundle.run import bundle_problem
+from epigauge.bundle.similarity import Similarity, normal_frame
+from epigauge.bundle.solve import Step
+from epigauge.bundle.strategies import STRATEGIES
+from laws import central_differences, distance
+
+Array = many_views.Array
+
+#: All but Table 1, which is of projective cameras.
+METHODS = [name for name in STRATEGIES if not name.startswith("gauge_invariant")]
+
+
+def scene(
+    model: str = "SIMPLE_RADIAL",
+    params: Any = ((1000.0, 320.0, 240.0, -0.1),),
+    camera_of_view: Any = (0, 0, 0, 0),
+    m: int = 25,
+    seed: int = 0,
+) -> tuple[eg.Tracks, eg.MetricReconstruction]:
+    """Return tracks with a noise of one pixel, and a start near the truth."""
+    rng = np.random.default_rng(seed)
+    n = len(camera_of_view)
+    truth = many_views.cameras_and_points(n, m, seed=seed)
+    K = np.array([[1000.0, 0.0, 320.0], [0.0, 1000.0, 240.0], [0.0, 0.0, 1.0]])
+    pose = np.linalg.solve(K, truth.P)
+    cameras = eg.Cameras(model, params, camera_of_view)
+    right = eg.MetricReconstruction(pose[:, :, :3], pose[:, :, 3], truth.Q[:, :3], cameras)
+    view, point = np.tile(np.arange(n), m), np.repeat(np.arange(m), n)
+    xy = right.project(eg.Tracks(view, point, np.zeros((n * m, 2))))
+    tracks = eg.Tracks(view, point, xy + rng.standard_normal(xy.shape))
+    X = right.X + 0.02 * rng.standard_normal(right.X.shape)
+    t = right.t + 0.02 * rng.standard_normal(right.t.shape)
+    return tracks, eg.MetricReconstruction(right.R, t, X, cameras)
+
+
+def problem_of(
+    tracks: eg.Tracks, start: eg.MetricReconstruction, backend: str | None = None, **options: Any
+) -> tuple[BundleProblem, BundleState]:
+    asked = {"refine": "all", "fixed_views": (), "fixed_points": (), "priors": None, **options}
+    job = metric_job(tracks, start, **asked)
+    graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+    problem = bundle_problem(
+        job.model,
+        kernels.table(backend),
+        graph,
+        job.q,
+        np.array(tracks.weights),
+        freedom=job.freedom,
+        priors=job.priors,
+    )
+    return problem, problem.evaluate(Estimate(job.cameras, job.points))
+
+
+COVARIANCE = np.array([[2e-4, 1e-4, 0.0], [1e-4, 3e-4, -1e-4], [0.0, -1e-4, 1e-4]])
+PRIORS = [
+    eg.PositionPrior(1, (-1.5, 0.1, -10.0), sigma=(0.01, 0.02, 0.05)),
+    eg.PositionPrior(3, (4.5, 0.1, -10.0), covariance=COVARIANCE),
+    eg.IntrinsicPrior(0, "f", 1010.0, 5.0),
+    eg.PointPrior(4, (0.1, 0.2, 0.0), covariance=COVARIANCE),
+]
+SHARED = {"params": [[1000.0, 320.0, 240.0, -0.1]] * 2, "camera_of_view": (0, 0, 1, 1)}
+LONE = {"params": [[1000.0, 320.0, 240.0, -0.1]] * 3, "camera_of_view": (0, 0, 1, 2)}
+CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "all": ({}, {}),
+    "groups": (SHARED, {"refine": ("f", "k")}),
+    "groups and lone views": (LONE, {"refine": ("k", "cx")}),
+    "pose": ({}, {"refine": "pose"}),
+    "fixed": (LONE, {"refine": ("f",), "fixed_views": [0, 3], "fixed_points": [2, 7, 8]}),
+    "priors": (SHARED, {"refine": ("f", "k"), "priors": PRIORS}),
+    "priors and fixed": (SHARED, {"fixed_views": [0], "fixed_points": [1], "priors": PRIORS}),
+}
+
+
+def residuals_of(problem: BundleProblem, state: BundleState, start: Any) -> Any:
+    """Return all residuals, priors' included, as a function of the unknowns."""
+    system = problem.linearize(state)
+    own = many_views.whole_ties(system)
+    n, d = system.normal.g_cameras.shape
+
+    def residuals(unknowns: Array) -> Array:
+        step = own @ unknowns
+        cameras, points = step[: n * d].reshape(n, d), step[n * d :].reshape(-1, 3)
+        moved = problem.retract(state, Step(cameras, points, 0.0))
+        r = [problem.linearizer.residuals(moved.cameras, moved.points).ravel()]
+        for prior in start:
+            if isinstance(prior, eg.IntrinsicPrior):
+                r.append(np.array([(moved.cameras[0, 12] - prior.value) / prior.sigma]))
+                continue
+            if isinstance(prior, eg.PositionPrior):
+                pose = moved.cameras[prior.view, :12].reshape(3, 4)
+                place = -pose[:, :3].T @ pose[:, 3]
+            else:
+                place = moved.points[prior.point]
+            C = prior.covariance
+            C = np.diag(np.square(prior.sigma)) if C is None else C
+            r.append(np.linalg.solve(np.linalg.cholesky(C), place - prior.position))
+        return np.concatenate(r)
+
+    return residuals, system
+
+
+@pytest.mark.parametrize("backend", ["numpy", "c"])
+@pytest.mark.parametrize("case", CASES)
+def test_normal_equations_and_steps_equal_a_dense_reference(case: str, backend: str) -> None:
+    many_views.need_backend(backend)
+    made, options = CASES[case]
+    tracks, start = scene(**made)
+    problem, state = problem_of(tracks, start, backend, **options)
+    residuals, system = residuals_of(problem, state, options.get("priors") or ())
+    count = system.gradient.size
+    scales = 1.0 / np.sqrt(np.maximum(np.diagonal(many_views.dense(system)), 1e-300))
+    J = central_differences(lambda z: residuals(scales * z), np.zeros(count), 1e-4)
+    J = J.reshape(-1, count)
+    r = residuals(np.zeros(count))
+    assert state.cost == pytest.approx(0.5 * r @ r, rel=1e-12)
+    N, g = J.T @ J, J.T @ r
+    frozen = ~many_views.whole_ties(system).any(axis=0)
+    N[frozen, frozen] = 1.0
+    found = many_views.dense(system) * scales[:, None] * scales
+    assert distance(found, N) < 1e-8
+    assert distance(system.gradient * scales / np.abs(g).max(), g / np.abs(g).max()) < 1e-8
+    blocks, lam = Covariant().blocks(system), 0.1
+    W = np.zeros((count, count))
+    sizes = system.U.shape[0] * system.U.shape[1], len(blocks.shared)
+    W[: sizes[0], : sizes[0]] = many_views.block_diagonal((blocks.cameras, np.zeros((0, 1, 1))))
+    middle = slice(sizes[0], sum(sizes))
+    W[middle, middle] = np.diag(blocks.shared)
+    W[sum(sizes) :, sum(sizes) :] = many_views.block_diagonal((blocks.points, np.zeros((0, 1, 1))))
+    dense = np.linalg.solve(found + lam * W * scales[:, None] * scales, -system.gradient * scales)
+    expected = many_views.whole_ties(system) @ (scales * dense)
+    step = np.asarray(system.damped_step(blocks, lam))
+    assert distance(step, expected) < 1e-8 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if case != "all"])
+def test_adjusted_ties_hold_and_the_gradient_vanishes(case: str) -> None:
+    made, options = CASES[case]
+    tracks, start = scene(**made)
+    found = eg.bundle_adjust(tracks, start, ftol=1e-14, **options)
+    moved = found.reconstruction
+    problem, state = problem_of(tracks, moved, **options)
+    before, _ = problem_of(tracks, start, **options)
+    scale = np.sqrt(np.maximum(np.diagonal(many_views.dense(problem.linearize(state))), 1e-300))
+    gradient = problem.linearize(state).gradient / scale
+    assert np.abs(gradient).max() < 1e-4 * np.sqrt(2.0 * state.cost)
+    assert found.cost == pytest.approx(state.cost, rel=1e-9)
+    for view in options.get("fixed_views", ()):
+        np.testing.assert_array_equal(moved.R[view], start.R[view])
+        np.testing.assert_array_equal(moved.t[view], start.t[view])
+    for point in options.get("fixed_points", ()):
+        np.testing.assert_array_equal(moved.X[point], start.X[point])
+    refine = options.get("refine", "all")
+    names = ["f", "cx", "cy", "k"]
+    for k, name in enumerate(names):
+        changed = (moved.cameras.params[:, k] != start.cameras.params[:, k]).all()
+        assert changed == (refine == "all" or name in refine)
+    assert before.freedom.ties.n_shared == problem.freedom.ties.n_shared
+
+
+def similarity(seed: int, size: float = 1.0) -> Similarity:
+    """Return a random similarity: scale 1e-3 to 1e3, origin up to 1e5 scene radii away."""
+    rng = np.random.default_rng(seed)
+    Q = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    s, far = 10.0 ** rng.uniform(-3, 3), rng.standard_normal(3)
+    far *= s * size * 10.0 ** rng.uniform(0, 5) / np.linalg.norm(far)
+    made: Similarity = eg.gauge.similarity(s, Q * np.sign(np.linalg.det(Q)), far)
+    return made
+
+
+class TestInvariance:
+    """The theorem of docs/gauges.md: equivariant update, covariant damping, choices by costs."""
+
+    def test_steps_are_equivariant_in_any_frame(self) -> None:
+        tracks, start = scene(**LONE)
+        problem, state = problem_of(tracks, start)
+        system = problem.linearize(state)
+        step = Covariant().step(system, 1e-3)
+        for seed in range(10):
+            rng = np.random.default_rng(seed)
+            there = replace(similarity(seed), target=rng.standard_normal(3))
+            moved = problem.evaluate(Estimate(*there.apply(state.cameras, state.points)))
+            other = Covariant().step(problem.linearize(moved), 1e-3)
+            cameras, points = there.blocks(4, 25, step.cameras.shape[1])
+            expected = np.einsum("nij,nj->ni", cameras, step.cameras)
+            size = np.abs(expected).max(axis=0)
+            assert distance(other.cameras / size, expected / size) < 1e-6
+            expected = np.einsum("mij,mj->mi", points, step.points)
+            size = np.abs(expected).max()
+            assert distance(other.points / size, expected / size) < 1e-6
+
+    def test_lambda_diag_of_the_usual_frame_is_not_invariant(self) -> None:
+        # Marquardt's diagonal of the points depends on the directions of the axes.
+        tracks, start = scene()
+        costs = [
+            eg.bundle_adjust(
+                tracks, eg.gauge.transform(start, similarity(seed)), method="marquardt", max_iter=3
+            )
+            .history[1]
+            .cost
+            for seed in range(3)
+        ]
+        assert np.ptp(costs) > 1e-6 * costs[0]
+
+    @pytest.mark.parametrize("case", ["pose", "groups", "priors"])
+    def test_whole_runs_are_the_same_in_any_frame(self, case: str) -> None:
+        made, options = CASES[case]
+        tracks, start = scene(**made)
+        expected = eg.bundle_adjust(tracks, start, **options)
+        for seed in range(20):
+            there, moved_options = similarity(seed), dict(options)
+            if options.get("priors"):
+                moved_options["priors"] = [_moved(prior, there) for prior in options["priors"]]
+            found = eg.bundle_adjust(tracks, eg.gauge.transform(start, there), **moved_options)
+            assert (found.nfev, found.status) == (expected.nfev, expected.status)
+            for a, b in zip(found.history, expected.history, strict=True):
+                assert a.cost == pytest.approx(b.cost, rel=1e-9)
+            back = eg.gauge.transform(found.reconstruction, there.inverse())
+            assert distance(back.X, expected.reconstruction.X) < 1e-3
+            assert distance(found.fun, expected.fun) < 1e-3
+
+    def test_the_normal_frame_is_the_same_from_anywhere(self) -> None:
+        _, start = scene()
+        points = normal_frame(start.vectors, start.X).positions(start.X)
+        for seed in range(5):
+            there = similarity(seed)
+            moved = eg.gauge.transform(start, there)
+            found = normal_frame(moved.vectors, moved.X).positions(moved.X)
+            assert distance(found @ there.rotation, points) < 1e-8
+
+
+def _moved(prior: Any, there: Similarity) -> Any:
+    if isinstance(prior, eg.IntrinsicPrior):
+        return prior
+    C = prior.covariance
+    C = np.diag(np.square(prior.sigma)) if C is None else C
+    C = there.scale**2 * there.rotation @ C @ there.rotation.T
+    place = there.positions(np.array([prior.position]))[0]
+    return replace(prior, position=place, sigma=None, covariance=0.5 * (C + C.T))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_reaches_the_same_cost(method: str) -> None:
+    tracks, start = scene()
+    best = eg.bundle_adjust(tracks, start, refine=("f",), ftol=1e-14)
+    found = eg.bundle_adjust(tracks, start, refine=("f",), method=method, ftol=1e-12, max_iter=300)
+    assert found.cost == pytest.approx(best.cost, rel=1e-4)
+    if method == "free":
+        assert found.nfev < 15
+    moved = found.reconstruction
+    if method in ("hartley", "bartoli"):
+        assert distance(moved.R[0], np.eye(3)) < 1e-12
+        assert distance(moved.t[0], np.zeros(3)) < 1e-12
+    if method in ("mclauchlan", "kanatani") and found.nit % STRATEGIES[method].every == 0:
+        assert distance(moved.X.mean(axis=0), np.zeros(3)) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"refine": ("f", "k3")}, "refine.*k3"),
+        ({"refine": 3}, "refine"),
+        ({"refine": ("f", "f")}, "twice"),
+        ({"refine": "pose", "fixed_views": range(4), "fixed_points": range(25)}, "nothing"),
+        ({"fixed_views": [4]}, "fixed_views.*4"),
+        ({"fixed_points": [-1]}, "fixed_points.*-1"),
+        ({"priors": [eg.PositionPrior(9, (0, 0, 0), sigma=1.0)]}, r"priors\[0\].view"),
+        ({"priors": [eg.PointPrior(1, (0, np.nan, 0), sigma=1.0)]}, "position"),
+        ({"priors": [eg.PointPrior(1, (0, 0, 0))]}, "neither"),
+        ({"priors": [eg.PointPrior(1, (0, 0, 0), covariance=-np.eye(3))]}, "positive definite"),
+        ({"priors": [eg.IntrinsicPrior(0, "k9", 0.0, 1.0)]}, "k9"),
+        ({"priors": [eg.IntrinsicPrior(1, "f", 0.0, 1.0)]}, "camera"),
+        ({"priors": [eg.IntrinsicPrior(0, "f", 1.0, 0.0)]}, "sigma"),
+        ({"priors": [PRIORS[2]], "refine": "pose"}, "fixes"),
+        ({"priors": [PRIORS[0]], "fixed_views": [1]}, "fixed"),
+        ({"priors": ["GPS"]}, "str"),
+        ({"priors": [PRIORS[0]], "method": "free"}, "method"),
+        ({"fixed_views": [0], "method": "hartley"}, "method"),
+        ({"method": "gauge_invariant"}, "gauge_invariant"),
+    ],
+)
+def test_bad_options_are_refused(options: dict[str, Any], named: str) -> None:
+    with pytest.raises(eg.ArgumentError, match=named):
+        eg.bundle_adjust(*scene(), **options)
+
+
+def test_what_only_metric_starts_have_is_refused_for_others() -> None:
+    tracks, start = scene()
+    for options in ({"refine": "pose"}, {"fixed_views": [0]}, {"priors": [PRIORS[0]]}):
+        with pytest.raises(eg.ArgumentError, match="projective start"):
+            eg.bundle_adjust(tracks, start.to_projective(), **options)
+
+
+def test_rank_counts_the_unknowns_and_what_fixes_the_gauge() -> None:
+    tracks, start = scene()
+    poses, points = 6 * 4, 3 * 25
+    for options, expected in (
+        ({}, poses + 4 + points - 7),
+        ({"refine": "pose"}, poses + points - 7),
+        ({"fixed_views": [0]}, poses - 6 + 4 + points - 1),
+        ({"fixed_points": [0, 1, 2]}, poses + 4 + points - 9),
+        ({"priors": [PRIORS[3]]}, poses + 4 + points - 4),
+        ({"refine": ("f",), "method": "hartley"}, poses - 6 + 1 + points - 1),
+    ):
+        found = eg.bundle_adjust(tracks, start, **options)
+        assert found.rank == expected, options
+        assert np.isfinite(found.condition)
+
+
+def test_gauge_groups_are_those_of_the_cameras() -> None:
+    tracks, start = scene()
+    assert eg.gauge.group("SIMPLE_RADIAL").dimension == 7
+    assert eg.gauge.group("projective").dimension == 15
+    cameras, points = eg.gauge.group("SIMPLE_RADIAL").generators(start)
+    problem, state = problem_of(tracks, start)
+    system = problem.linearize(state)
+    for k in range(7):
+        x, y = system.product(cameras[..., k], points[..., k])
+        assert np.abs(x).max() < 1e-9 * np.abs(system.U).max()
+        assert np.abs(y).max() < 1e-9 * np.abs(system.V).max()
+    with pytest.raises(eg.ArgumentError, match="projective cameras"):
+        eg.gauge.group("projective").generators(start)
+    with pytest.raises(eg.ArgumentError, match="T"):
+        eg.gauge.transform(start, np.eye(4))
+    with pytest.raises(eg.ArgumentError, match="reflection"):
+        eg.gauge.similarity(1.0, -np.eye(3), np.zeros(3))
+
+
+#: Steps to 1e-6 of the optimum that are enough (measured: 6 and 4), and the optimum.
+BAL = {"problem-49-7776": (8, 13344.2403), "problem-16-22106": (6, 18033.90348)}
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) for n in BAL])
+def test_bal_problems_reach_the_optimum_in_few_steps(data_dir: Path, name: str) -> None:
+    many_views.need_backend("c")
+    enough, optimum = BAL[name]
+    tracks, start = eg.load_scene(data_dir / "bal" / f"{name}-pre.txt.bz2")
+    expected = eg.bundle_adjust(tracks, start)
+    assert expected.cost == pytest.approx(optimum, rel=1e-7)
+    size = float(np.median(np.linalg.norm(start.X - start.X.mean(axis=0), axis=1)))
+    for result in (
+        expected,
+        *(
+            eg.bundle_adjust(tracks, eg.gauge.transform(start, similarity(seed, size)))
+            for seed in range(3)
+        ),
+    ):
+        near = [row.cost <= optimum * (1.0 + 1e-6) for row in result.history]
+        assert near.index(True) <= enough
+        assert len(result.history) == len(expected.history)
+        for a, b in zip(result.history, expected.history, strict=True):
+            assert a.cost == pytest.approx(b.cost, rel=2e-9)
