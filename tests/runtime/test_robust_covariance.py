@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import epigauge as eg
+import many_views
 import numpy as np
 import pytest
+from epigauge import kernels
+from epigauge.multi_view.sandwich import influence as influence_of_many
 from epigauge.two_view.covariance import influence, residual_noise, truncated_deviation
 from epigauge.two_view.losses import Loss
 from two_views import Array, normalizing
@@ -124,3 +127,88 @@ class TestNoise:
         a, b = influence(d, w, Loss(), 1, 1.0)
         np.testing.assert_array_equal(a, w)
         np.testing.assert_array_equal(b, w)
+
+
+def tracks_with_errors(
+    rng: np.random.Generator, share: float, off: float
+) -> tuple[eg.Tracks, eg.Reconstruction]:
+    """Five views of forty points, noise of 1 px, some observations off; and the truth."""
+    truth = many_views.cameras_and_points(5, 40, seed=1)
+    tracks = many_views.observed(truth, 0.0, seed=1)
+    xy = tracks.xy + rng.standard_normal(tracks.xy.shape)
+    wrong = rng.choice(len(xy), round(share * len(xy)), replace=False)
+    angle = rng.uniform(0, 2 * np.pi, len(wrong))
+    length = off if off > 10.0 else off * np.abs(rng.standard_normal(len(wrong)))
+    xy[wrong] += (length * np.array([np.cos(angle), np.sin(angle)])).T
+    return eg.Tracks(tracks.view, tracks.point, xy), truth
+
+
+class TestManyViews:
+    @pytest.mark.parametrize(("share", "off"), [(0.0, 0.0), (0.05, 60.0), (0.15, 5.0)])
+    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    def test_errors_of_projections_are_as_large_as_promised(self, loss, share, off) -> None:
+        """Projected points do not depend on the gauge: their errors, in units of the covariance."""
+        rng = np.random.default_rng(5)
+        found = []
+        for _ in range(8):
+            tracks, truth = tracks_with_errors(rng, share, off)
+            r = eg.bundle_adjust(tracks, truth, loss=loss)
+            spread = eg.covariance(
+                tracks, r.reconstruction, loss=loss, loss_scale_px=r.loss_scale_px
+            )
+            error = r.reconstruction.project(tracks) - truth.project(tracks)
+            squares = np.einsum("ki,kij,kj->k", error, np.linalg.inv(spread.projections), error)
+            found.append(np.mean(np.minimum(squares, 40.0)) / 2.0)
+        assert 0.8 <= np.mean(found) <= 1.3
+
+    def test_equals_the_dense_sandwich(self) -> None:
+        rng = np.random.default_rng(6)
+        tracks, truth = tracks_with_errors(rng, 0.1, 20.0)
+        r = eg.bundle_adjust(tracks, truth, loss="huber", ftol=1e-12)
+        scale, found = r.loss_scale_px, r.reconstruction
+        n, m = tracks.n_views, tracks.n_points
+        spread = eg.covariance(tracks, found, loss="huber", loss_scale_px=scale)
+        said = influence_of_many(
+            tracks.xy - found.project(tracks),
+            np.ones(len(tracks)),
+            Loss("huber", scale),
+            11 * n + 3 * m - 15,
+        )
+        assert len(said.wrong) > 10
+        _, J_P, J_Q, _ = kernels.table("numpy").project(
+            found.P.transpose(1, 2, 0)[:, :, tracks.view], found.Q.T[:, tracks.point]
+        )
+        J = np.zeros((len(tracks), 2, 12 * n + 4 * m))
+        for k, (i, j) in enumerate(zip(tracks.view, tracks.point, strict=True)):
+            J[k, :, 12 * i : 12 * i + 12] = J_P[:, :, k]
+            J[k, :, 12 * n + 4 * j : 12 * n + 4 * j + 4] = J_Q[:, :, k]
+        # Columns of one size, so that the pseudo-inverse of the dense matrix keeps its digits
+        size = np.sqrt(np.sum(J**2, axis=(0, 1)))
+        J = J / size
+        A = np.einsum("k,kip,kiq->pq", said.weights, J, J)
+        B = said.kappa * A
+        B += np.einsum("kip,kij,kjq->pq", J[said.wrong], said.rest, J[said.wrong])
+        values, vectors = np.linalg.eigh(A)
+        kept = slice(15 + n + m, None)
+        inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
+        expected = said.noise**2 * J @ (inverse @ B @ inverse) @ np.swapaxes(J, 1, 2)
+        assert spread.noise_px == pytest.approx(said.noise)
+        np.testing.assert_allclose(spread.projections, expected, rtol=1e-4, atol=1e-6)
+        some = np.arange(0, len(tracks), 7)
+        projected = spread.of_projections(tracks.view[some], tracks.point[some])
+        np.testing.assert_allclose(projected, spread.projections[some], rtol=1e-6, atol=1e-9)
+        fixed = spread.in_gauge(eg.gauge.two_cameras())
+        full = fixed.dense()
+        np.testing.assert_allclose(full[24:36, 24:36], fixed.cameras[2], rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(full[-4:, -4:], fixed.points[-1], rtol=1e-6, atol=1e-12)
+
+    def test_without_influence_of_the_loss_it_is_the_plain_covariance(self) -> None:
+        rng = np.random.default_rng(7)
+        ratios = []
+        for _ in range(8):
+            tracks, truth = tracks_with_errors(rng, 0.0, 0.0)
+            plain = eg.covariance(tracks, truth, noise_px=1.0).projections
+            wide = eg.covariance(tracks, truth, noise_px=1.0, loss="huber", loss_scale_px=1e4)
+            ratios.append(np.trace(wide.projections.sum(axis=0)) / np.trace(plain.sum(axis=0)))
+        # At the truth no redundancy is lost: 400 residual coordinates count as 205
+        assert np.mean(ratios) == pytest.approx(1.0, abs=0.06)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
-from epigauge._arguments import as_positive
+from epigauge._arguments import as_choice, as_positive
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer, inverse_roots
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.solve import System
@@ -29,8 +29,9 @@ from epigauge.multi_view.gauge import (
     identity,
     normalized,
 )
+from epigauge.multi_view.sandwich import Sandwich, influence
 from epigauge.multi_view.tracks import Reconstruction, Tracks
-from epigauge.two_view.losses import Loss
+from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
 
 __all__ = ["ReconstructionCovariance", "covariance"]
 
@@ -59,7 +60,7 @@ class ReconstructionCovariance:
     reconstruction: Reconstruction
     noise_px: float
     projector: Projector
-    _inverse: _Inverse
+    _inverse: Inverse | Sandwich
     _maps: tuple[Array, Array]
 
     def in_gauge(self, gauge: Gauge) -> ReconstructionCovariance:
@@ -187,6 +188,8 @@ def covariance(
     gauge: Gauge | None = None,
     noise_px: float | None = None,
     *,
+    loss: str = "linear",
+    loss_scale_px: float | str = "auto",
     backend: str | None = None,
 ) -> ReconstructionCovariance:
     """Return the covariance of an adjusted reconstruction, in any gauge.
@@ -194,7 +197,8 @@ def covariance(
     Parameters
     ----------
     tracks : Tracks
-        Observations that the reconstruction was adjusted to (with their weights, linear loss).
+        Observations that the reconstruction was adjusted to, with their weights: zero for those
+        that were set aside.
     reconstruction : Reconstruction
         Cameras and points at the minimum.
     gauge : Gauge, optional
@@ -204,7 +208,13 @@ def covariance(
         basis in the normalised one) is treated like that, too.
     noise_px : float, optional
         Standard deviation of an image coordinate of weight one. By default estimated from the
-        residuals: sqrt(sum of weighted squares / (2 N - 11 n - 3 m + 15)).
+        residuals: sqrt(sum of weighted squares / (2 N - 11 n - 3 m + 15)), with a robust loss over
+        those within three standard deviations (`epigauge.multi_view.sandwich.influence`).
+    loss : {"linear", "huber", "soft_l1", "cauchy", "truncated"}
+        What the reconstruction was adjusted with. Under a robust loss the covariance is that of an
+        M-estimate, A^-1 B A^-1, with wrong observations counted one by one.
+    loss_scale_px : float or "auto"
+        Its scale, as `BundleResult.loss_scale_px`; by default from these residuals.
     backend : {"c", "numpy", "casadi"}, optional
         Where the formulas are computed.
 
@@ -241,19 +251,26 @@ def covariance(
     home = normalized().transformation(frame.cameras_in(P), Q)
     graph = ObservationGraph(tracks.view, tracks.point, n, m)
     table, q = kernels.table(backend), frame.conditioned(tracks)
-    parts = camera_model("projective"), table, graph, q, np.asarray(tracks.weights)
+    found, weights = None, np.asarray(tracks.weights)
+    if as_choice("loss", loss, LOSSES) != "linear":
+        robust = _robust(tracks, reconstruction, loss, loss_scale_px)
+        found = influence(*robust, 11 * n + 3 * m - 15)
+        weights = found.weights
+    parts = camera_model("projective"), table, graph, q, weights
     linearizer = NumpyLinearizer(*parts, Loss())
     moved_P, moved_Q = home.apply(frame.cameras_in(P), Q)
     state = moved_P.reshape(-1, 12), moved_Q
     cost = 0.5 * float(np.sum(linearizer.point_costs(*state)))
-    if noise_px is None:
+    if noise_px is not None:
+        noise_px = as_positive("noise_px", noise_px)
+    elif found is not None:
+        noise_px = found.noise
+    else:
         redundancy = 2 * int(np.count_nonzero(tracks.weights)) - 11 * n - 3 * m + 15
         if redundancy <= 0:
             raise ArgumentError("noise_px", "is not given", "a number: nothing is redundant")
         noise_px = frame.scale * float(np.sqrt(2.0 * cost / redundancy))
-    else:
-        noise_px = as_positive("noise_px", noise_px)
-    inverse = _Inverse.of(linearizer, state, frame.scale)
+    inverse = Inverse.of(linearizer, state, frame.scale)
     # From whitened parameters at home to the reconstruction as given, in pixels.
     cameras, points = home.inverse().blocks()
     pixels = np.zeros((n, 3, 3))
@@ -261,14 +278,26 @@ def covariance(
     pixels[:, :2, 2], pixels[:, 2, 2] = frame.origins, 1.0
     out = np.einsum("nij,kl->nikjl", pixels, np.eye(4)).reshape(n, 12, 12)
     maps = (out @ cameras @ inverse.whitening[0], points @ inverse.whitening[1])
+    whole = inverse if found is None else Sandwich(inverse, found)
     free = ReconstructionCovariance(
-        reconstruction, noise_px, projector(identity(), P, Q), inverse, maps
+        reconstruction, noise_px, projector(identity(), P, Q), whole, maps
     )
     return free if gauge is None else free.in_gauge(gauge)
 
 
+def _robust(
+    tracks: Tracks, reconstruction: Reconstruction, loss: str, loss_scale_px: float | str
+) -> tuple[Array, Array, Loss]:
+    """Return residuals and weights in pixels, and the loss."""
+    r, weights = tracks.xy - reconstruction.project(tracks), np.asarray(tracks.weights)
+    if loss_scale_px == "auto":
+        scale = robust_scale(np.linalg.norm(r, axis=1)[weights > 0.0])
+        return r, weights, Loss(loss, EFFICIENT[loss] * max(scale, 1e-12))
+    return r, weights, Loss(loss, as_positive("loss_scale_px", loss_scale_px))
+
+
 @dataclass(frozen=True)
-class _Inverse:
+class Inverse:
     """A generalised inverse X of N, in parameters in which W of the covariant damping is one.
 
     X = (N + A A^T)^-1 with A along the scales and, for the cameras, the changes of basis: the
@@ -305,7 +334,7 @@ class _Inverse:
     scale: float
 
     @staticmethod
-    def of(linearizer: NumpyLinearizer, state: tuple[Array, Array], scale: float) -> _Inverse:
+    def of(linearizer: NumpyLinearizer, state: tuple[Array, Array], scale: float) -> Inverse:
         """Invert the normal equations at a state."""
         try:
             normal = linearizer.linearize(*state)
@@ -339,7 +368,7 @@ class _Inverse:
         views, points_of = whitening[0][layout.view], whitening[1][layout.point]
         W = np.swapaxes(views, 1, 2) @ linearizer.coupling_blocks(*state) @ points_of
         Y = W @ V_inverse[layout.point]
-        return _Inverse(
+        return Inverse(
             layout,
             0.5 * (inverse + inverse.T),
             V_inverse,
@@ -411,14 +440,18 @@ class _Inverse:
         self, views: Indices, points: Indices, X_ii: Array, X_ij: Array, X_jj: Array
     ) -> Array:
         """Return J X J^T of points in views from the blocks of X."""
+        J_camera, J_point = self.jacobians(views, points)
+        mixed = J_camera @ X_ij @ np.swapaxes(J_point, 1, 2)
+        found = J_camera @ X_ii @ np.swapaxes(J_camera, 1, 2)
+        found = found + J_point @ X_jj @ np.swapaxes(J_point, 1, 2)
+        return np.asarray(found + mixed + np.swapaxes(mixed, 1, 2))
+
+    def jacobians(self, views: Indices, points: Indices) -> tuple[Array, Array]:
+        """Return derivatives (k, 2, 12), (k, 2, 4) of points in views, by whitened parameters."""
         P = self.state[0].reshape(-1, 3, 4).transpose(1, 2, 0)[:, :, views]
         Q = self.state[1].T[:, points]
         _, J_P, J_Q, _ = self.linearizer.kernels.project(
             np.ascontiguousarray(P), np.ascontiguousarray(Q)
         )
         J_camera = J_P.transpose(2, 0, 1) @ self.whitening[0][views]
-        J_point = J_Q.transpose(2, 0, 1) @ self.whitening[1][points]
-        mixed = J_camera @ X_ij @ np.swapaxes(J_point, 1, 2)
-        found = J_camera @ X_ii @ np.swapaxes(J_camera, 1, 2)
-        found = found + J_point @ X_jj @ np.swapaxes(J_point, 1, 2)
-        return np.asarray(found + mixed + np.swapaxes(mixed, 1, 2))
+        return J_camera, J_Q.transpose(2, 0, 1) @ self.whitening[1][points]

@@ -1,0 +1,212 @@
+"""Covariance of a reconstruction under a robust loss: A^-1 B A^-1, wrong observations one by one.
+
+Right observations share the mean slope and the mean power of the loss, so that B = kappa A but for
+the wrong ones: A^-1 B A^-1 = kappa A^-1 + Z C Z^T with Z = A^-1 J^T of the wrong observations. No
+matrix larger than those of least squares is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.errors import ArgumentError
+from epigauge.two_view.losses import Loss, median
+
+if TYPE_CHECKING:
+    from epigauge.multi_view.uncertainty import Inverse
+
+__all__ = ["Influence", "Sandwich", "influence"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: Median and cut of the length of a standard normal vector of the plane, and the share within.
+_MEDIAN = float(np.sqrt(2.0 * np.log(2.0)))
+_CUT = 3.0
+_BEYOND = float(np.exp(-0.5 * _CUT**2))
+
+#: Wrong observations worked on at a time.
+_CHUNK = 32
+
+
+@dataclass(frozen=True)
+class Influence:
+    """What observations add to the Hessian and to the covariance of the gradient.
+
+    Attributes
+    ----------
+    noise : float
+        Standard deviation of a coordinate of weight one, in the unit of the residuals.
+    weights : ndarray, shape (N,)
+        a in A = sum(a J^T J).
+    kappa : float
+        B / A of the right observations, in units of the noise squared.
+    wrong : ndarray of int, shape (k,)
+        The others.
+    rest : ndarray, shape (k, 2, 2)
+        Their own blocks of B in these units, less kappa times those of A.
+    """
+
+    noise: float
+    weights: Array
+    kappa: float
+    wrong: Indices
+    rest: Array
+
+
+def influence(r: Array, weights: Array, loss: Loss, parameters: int) -> Influence:
+    """Return what each observation adds, as `epigauge.two_view.covariance.influence`.
+
+    Parameters
+    ----------
+    r : ndarray, shape (N, 2)
+        Residuals.
+    weights : ndarray, shape (N,)
+        Of their squares.
+    loss : Loss
+        Applied to each squared distance.
+    parameters : int
+        Number of parameters fitted, without the gauge.
+
+    Returns
+    -------
+    Influence
+        The noise is that of the observations within three standard deviations, with the factor for
+        what this cuts off a normal distribution.
+
+    Raises
+    ------
+    ArgumentError
+        If there is nothing to estimate the noise from.
+    """
+    squared = np.sum(r**2, axis=1)
+    lengths, counts = np.sqrt(weights * squared), weights > 0.0
+    redundant = 2 * int(np.count_nonzero(counts)) - parameters
+    if redundant <= 0:
+        raise ArgumentError("noise_px", "is not given", "a number: nothing is redundant")
+    share = redundant / (redundant + parameters)
+    rough = median(lengths[counts]) / _MEDIAN / np.sqrt(share)
+    right = counts & (lengths <= _CUT * rough)
+    number = 2 * int(np.count_nonzero(right))
+    variance = float(np.sum(lengths[right] ** 2)) / max(number - parameters, 1)
+    # Mean square of a coordinate within the cut, over one
+    variance /= 1.0 - 0.5 * _CUT**2 * _BEYOND / (1.0 - _BEYOND)
+    none = np.zeros(0, dtype=np.intp)
+    if variance == 0.0:
+        return Influence(0.0, weights, 1.0, none, np.zeros((0, 2, 2)))
+    right = counts & (lengths <= _CUT * np.sqrt(variance))
+    number = 2 * int(np.count_nonzero(right))
+    redundancy = number / max(number - parameters, 1)
+    _, first, second = loss(squared)
+    # Mean eigenvalue of the second derivative, first I + 2 second r r^T
+    slope = first + second * squared
+    mean = float(np.mean(slope[right]))
+    if loss.name == "truncated":  # psi falls to zero at the scale
+        jump = 0.5 * loss.scale**2 / variance
+        mean = max(mean - jump * float(np.exp(-jump)) / (1.0 - _BEYOND), 1e-3)
+    power = 0.5 * float(np.mean(weights[right] * (first**2 * squared)[right]))
+    kappa = power * redundancy / (mean * variance)
+    a = weights * np.where(right, mean, np.maximum(slope, 0.0))
+    wrong = np.flatnonzero(counts & ~right & (first > 0.0))
+    psi = (weights * first)[wrong, None] * r[wrong]
+    rest = redundancy / variance * psi[:, :, None] * psi[:, None]
+    rest -= kappa * a[wrong, None, None] * np.eye(2)
+    return Influence(float(np.sqrt(variance)), a, kappa, wrong, rest)
+
+
+@dataclass(frozen=True)
+class Sandwich:
+    """A^-1 B A^-1, with the methods of the plain inverse.
+
+    Attributes
+    ----------
+    plain : Inverse
+        A^-1.
+    influence : Influence
+        Right and wrong observations.
+    """
+
+    plain: Inverse
+    influence: Influence
+
+    @property
+    def scale(self) -> float:
+        """Pixels a unit of the image."""
+        return self.plain.scale
+
+    @property
+    def cameras(self) -> Array:
+        """The cameras' part, (12 n, 12 n)."""
+        return self._blocks[0]
+
+    @property
+    def points(self) -> Array:
+        """The points' diagonal blocks, (m, 4, 4)."""
+        return self._blocks[1]
+
+    @property
+    def observed(self) -> Array:
+        """J X J^T of each observation, (N, 2, 2)."""
+        return self._blocks[2]
+
+    def apply(self, vectors: Array) -> Array:
+        """Return X times vectors (12 n + 4 m, r)."""
+        found = self.influence.kappa * self.plain.apply(vectors)
+        for Z, C in self._parts():
+            along = np.einsum("pki,pr->kir", Z, vectors, optimize=True)
+            found += np.einsum("pki,kij,kjr->pr", Z, C, along, optimize=True)
+        return found
+
+    def projected(self, views: Indices, points: Indices) -> Array:
+        """Return J X J^T of any points in any views, (k, 2, 2)."""
+        found = np.empty((len(views), 2, 2))
+        for k in range(0, len(views), _CHUNK):
+            rows = self._rows(views[k : k + _CHUNK], points[k : k + _CHUNK])
+            X = self.apply(rows.reshape(len(rows), -1)).reshape(rows.shape)
+            found[k : k + _CHUNK] = np.einsum("pki,pkj->kij", rows, X)
+        return found
+
+    @cached_property
+    def _blocks(self) -> tuple[Array, Array, Array]:
+        kappa, layout = self.influence.kappa, self.plain.layout
+        cameras, points = kappa * self.plain.cameras, kappa * self.plain.points
+        observed = kappa * self.plain.observed
+        size = len(cameras)
+        J_camera, J_point = self.plain.jacobians(layout.view, layout.point)
+        for Z, C in self._parts():
+            first = Z[:size].reshape(size, -1)
+            second = Z[size:].reshape(len(points), 4, -1)
+            middle = np.zeros((len(C), 2, len(C), 2))
+            middle[np.arange(len(C)), :, np.arange(len(C))] = C
+            middle = middle.reshape(2 * len(C), -1)
+            cameras += first @ middle @ first.T
+            points += second @ middle @ np.swapaxes(second, 1, 2)
+            seen = J_camera @ first.reshape(layout.n_views, 12, -1)[layout.view]
+            seen += J_point @ second[layout.point]
+            observed += seen @ middle @ np.swapaxes(seen, 1, 2)
+        return cameras, points, observed
+
+    def _parts(self) -> Iterator[tuple[Array, Array]]:
+        """Yield A^-1 J^T (12 n + 4 m, k, 2) and C (k, 2, 2) of some wrong observations."""
+        layout = self.plain.layout
+        for k in range(0, len(self.influence.wrong), _CHUNK):
+            wrong = self.influence.wrong[k : k + _CHUNK]
+            rows = self._rows(layout.view[wrong], layout.point[wrong])
+            Z = self.plain.apply(rows.reshape(len(rows), -1)).reshape(rows.shape)
+            yield Z, self.influence.rest[k : k + _CHUNK]
+
+    def _rows(self, views: Indices, points: Indices) -> Array:
+        """Return J^T of points in views, (12 n + 4 m, k, 2)."""
+        layout, k = self.plain.layout, np.arange(len(views))
+        J_camera, J_point = self.plain.jacobians(views, points)
+        cameras = np.zeros((layout.n_views, 12, len(views), 2))
+        own = np.zeros((layout.n_points, 4, len(views), 2))
+        cameras[views, :, k] = np.swapaxes(J_camera, 1, 2)
+        own[points, :, k] = np.swapaxes(J_point, 1, 2)
+        return np.concatenate([cameras.reshape(-1, len(views), 2), own.reshape(-1, len(views), 2)])
