@@ -111,7 +111,7 @@ class TestCheirality:
         r = eg.refine_fundamental(x1, x2, essential=True, noise_px=None)
         d, h1, h2 = eg.reprojection_distances(r.F, x1, x2)
         matches = Calibrated(x1.T, x2.T, np.eye(3), np.eye(3))
-        motion = matches.motion(r.F, (h1.T, h2.T), d**2, lambda s: s.sum(axis=-1))
+        motion = matches.motion(r.F, (h1.T, h2.T), d**2, np.ones(12), np.mean(d**2))
         z = depths(r, h1, h2, np.eye(3))
         np.testing.assert_allclose(motion.R, r.R, atol=1e-12)
         np.testing.assert_array_equal(motion.excess == 0.0, (z > 0.0).all(axis=1))
@@ -183,6 +183,32 @@ class TestFewMatches:
             eg.refine_fundamental(x1, x2)
         with pytest.raises(ArgumentError, match="fewer than 5"):
             eg.refine_fundamental(x1, x2, essential=True, weights=[1, 1, 1, 1, 0, 0, 0])
+
+
+class TestGrossErrors:
+    @pytest.mark.parametrize("wrong", [0, 30])
+    @pytest.mark.parametrize("kind", ["general", "forward", "plane", "narrow"])
+    @pytest.mark.parametrize("seed", [0, 2])
+    def test_sixty_right_matches_are_found_and_agree(self, seed, kind, wrong) -> None:
+        pytest.importorskip("poselib")
+        rng = np.random.default_rng(seed)
+        K = np.array([[900.0, 0, 500], [0, 900, 400], [0, 0, 1]])
+        R, t = rotation([0.05, -0.15, 0.04]), np.array([-1.0, 0.1, 0.2])
+        X = np.column_stack([rng.uniform(-1, 1, (60, 2)), rng.uniform(3, 5, 60)])
+        if kind == "forward":
+            R, t = rotation([0.01, 0.02, 0.0]), np.array([0.05, 0.0, 0.5])
+        elif kind == "plane":
+            X[:, 2] = 4.0 + 0.3 * X[:, 0]
+        elif kind == "narrow":
+            K[[0, 1], [0, 1]] = 9000.0
+            R, t, X = rotation([0.005, -0.02, 0.01]), 0.3 * t, X * [0.1, 0.1, 1.0]
+        x1, x2 = (pixels(K, Y) + rng.normal(0, 0.5, (60, 2)) for Y in (X, X @ R.T + t))
+        x1, x2 = (np.concatenate([x, rng.uniform(0, 900, (wrong, 2))]) for x in (x1, x2))
+        r = eg.estimate_fundamental(x1, x2, essential=True, K1=K)
+        assert r.inlier[:60].sum() >= 57
+        assert degrees(r.t, t) <= (8.0 if kind in ("narrow", "plane") else 3.0)
+        # A wrong match that agrees by chance may be behind; it turns no motion round
+        assert r.in_front >= 57
 
 
 class TestFivePoint:

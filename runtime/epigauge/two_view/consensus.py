@@ -22,7 +22,7 @@ from epigauge.two_view.conditioning import RMS
 from epigauge.two_view.criteria import Reprojection
 from epigauge.two_view.eliminated import EliminatedProblem
 from epigauge.two_view.losses import Mixture
-from epigauge.two_view.parameterizations import Block
+from epigauge.two_view.parameterizations import Block, Parameterization
 
 __all__ = ["RANGE", "Agreement", "Consensus"]
 
@@ -117,7 +117,7 @@ class Consensus:
     ) -> None:
         self.widest = widest
         self.criterion = Reprojection(kernels, q1, q2)
-        self.block = Block(kernels)
+        self.chart: Parameterization = Block(kernels)
         ones = np.ones((1, q1.shape[1]))
         self.h1, self.h2 = np.vstack([q1, ones]), np.vstack([q2, ones])
         self.few = slice(None, None, -(-q1.shape[1] // _FEW))
@@ -150,14 +150,14 @@ class Consensus:
         for _ in range(_CLIMBS):
             problem = EliminatedProblem(
                 self.criterion,
-                self.block,
+                self.chart,
                 best.oriented.astype(np.float64),
                 best.mixture,
                 exact=True,
             )
             stopping = lm.Stopping(ftol=1e-6, max_iter=10)
             found = lm.minimize(
-                problem, self.block.start(best.F), Levenberg(), lm.Classic(), stopping
+                problem, self.chart.start(best.F), Levenberg(), lm.Classic(), stopping
             )
             trial = self.judge(found.state.F, best.sigma, best.share)
             if trial.score <= best.score + _CLIMBED:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +15,13 @@ __all__ = ["Calibrated", "Essential", "Motion", "in_front", "motion_from_essenti
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+#: Squared standard deviations that a match may speak against a motion at most: one wrong match far
+#: behind the cameras must not turn the motion of all others round.
+_DOUBT = 9.0
+
+#: A noise below this, in conditioned coordinates, is rounding.
+_ROUNDING = 1e-8
 
 _QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -84,14 +90,15 @@ class Motion:
     excess : ndarray, shape (m,)
         By how much the squared distance of each match to the nearest match of a point in front of
         both cameras exceeds that to the epipolar geometry: zero for points in front.
-    cost : float or ndarray
-        That of the squared distances with the excess.
+    doubt : float or ndarray
+        Half the excess in units of the noise squared, no match counting more than three standard
+        deviations: what speaks against points in front, beside the cost.
     """
 
     R: Array
     t: Array
     excess: Array
-    cost: Any
+    doubt: Any
 
 
 class Calibrated:
@@ -129,7 +136,8 @@ class Calibrated:
         F: Array,
         hats: tuple[Array, Array],
         squared: Array,
-        cost: Callable[[Array], Any],
+        weights: Array,
+        noise2: Array | float,
         unit2: Array | float = 1.0,
     ) -> Motion:
         """Choose among the four motions of essential matrices (cheirality).
@@ -142,15 +150,17 @@ class Calibrated:
             Corrected matches.
         squared : ndarray, shape (..., m)
             Their squared distances from the measured ones, over `unit2`.
-        cost : callable
-            From squared distances (..., m) to costs (...).
+        weights : ndarray, shape (m,)
+            Of the matches.
+        noise2 : float or ndarray, shape (...)
+            Variance of a coordinate of weight one.
         unit2 : ndarray, shape (m,), optional
             Unit of the squared distances.
 
         Returns
         -------
         Motion
-            The one with the lowest cost; all of it with the leading axes of F.
+            The one with the least doubt; all of it with the leading axes of F.
 
         Notes
         -----
@@ -163,13 +173,14 @@ class Calibrated:
         R, t = motions(np.swapaxes(self.A2, 0, 1) @ F @ self.A1)
         nearest = self._from_ends(R, t) / unit2
         excess = np.where(in_front(R, t, *rays), 0.0, np.maximum(nearest - squared, 0.0))
-        costs = np.asarray(cost(squared + excess))
-        best = np.argmin(costs, axis=0)[None, ..., None]
+        least2 = np.maximum(noise2, _ROUNDING**2)[..., None]
+        doubt = 0.5 * np.sum(np.minimum(weights * excess / least2, _DOUBT), axis=-1)
+        best = np.argmin(doubt, axis=0)[None, ..., None]
         return Motion(
             np.take_along_axis(R, best[..., None], axis=0)[0],
             np.take_along_axis(t, best, axis=0)[0],
             np.take_along_axis(excess, best, axis=0)[0],
-            np.take_along_axis(costs, best[..., 0], axis=0)[0],
+            np.take_along_axis(doubt, best[..., 0], axis=0)[0],
         )
 
     def _from_ends(self, R: Array, t: Array) -> Array:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from math import comb, factorial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from epigauge import kernels
 from epigauge.two_view.essential import Calibrated
 
-__all__ = ["essential_5point", "essential_starts"]
+__all__ = ["essential_5point", "essential_starts", "log_cost"]
 
 Array = NDArray[np.float64]
 
@@ -39,6 +38,12 @@ _DISTINCT = 1e-2
 _CANDIDATES = 5
 _LINEAR_LEAST = 8
 _SEED = 20040601
+
+#: Median of the square of a standard normal variable.
+_MEDIAN2 = 0.455
+
+#: A distance below this, in conditioned coordinates, is rounding.
+_ROUNDING = 1e-12
 
 
 def essential_5point(rays1: Array, rays2: Array) -> tuple[Array, NDArray[np.intp]]:
@@ -165,19 +170,33 @@ def essential_starts(
     squared = _sampson(F, few.q1, few.q2)
     scale2 = max(float(np.min(np.median(squared, axis=1))), np.finfo(float).tiny)
 
-    def cost(squared: Array) -> Any:
-        return np.sum(np.log1p(squared / scale2) if robust else squared, axis=-1)
+    def cost(squared: Array) -> Array:
+        if robust:
+            return np.asarray(np.sum(np.log1p(squared / scale2), axis=1))
+        return log_cost(np.sum(squared, axis=1), len(counts))
 
     # Sampson's distances, and depths of the matches as measured, are good enough to choose starts
     best = np.argsort(cost(squared))[: _CANDIDATES * count]
     F, squared = F[best], squared[best]
-    order = np.argsort(few.motion(F, (few.q1, few.q2), squared, cost).cost)
+    noise2 = np.sum(squared, axis=1) / max(len(counts) - 5, 1)
+    if robust:
+        noise2 = np.median(squared, axis=1) / _MEDIAN2
+    motion = few.motion(F, (few.q1, few.q2), squared, np.ones(len(counts)), noise2)
+    order = np.argsort(cost(squared) + motion.doubt)
     found: list[Array] = []
     for candidate in F[order]:
         near = (min(np.linalg.norm(candidate - f), np.linalg.norm(candidate + f)) for f in found)
         if len(found) < count and all(distance > _DISTINCT for distance in near):
             found.append(candidate)
     return found
+
+
+def log_cost(squares: Array, m: int) -> Array:
+    """Return -log(likelihood) of an essential matrix with a sum of squares of m matches.
+
+    The noise is not known: log(squares) (m - 5) / 2, comparable with `Motion.doubt`.
+    """
+    return np.asarray(0.5 * (m - 5) * np.log(np.maximum(squares, m * _ROUNDING**2)))
 
 
 def _subsets(m: int, rng: np.random.Generator) -> NDArray[np.intp]:

@@ -18,6 +18,7 @@ from epigauge.two_view.covariance import residual_noise, tangent_basis
 from epigauge.two_view.criteria import Reprojection
 from epigauge.two_view.diagnostics import Evidence, evidence
 from epigauge.two_view.essential import Motion
+from epigauge.two_view.five_point import log_cost
 from epigauge.two_view.losses import Loss
 from epigauge.two_view.solve import Matches, Options, Solution, joined, minimize
 
@@ -191,7 +192,10 @@ def chosen(matches: Matches, options: Options, found: list[Solution]) -> Search:
     )
     first = next((k for k, minimum in enumerate(minima) if minimum.oriented), 0)
     if options.calibration is not None:
-        first = int(np.argmin([motion.cost for motion in motions if motion is not None]))
+        m = int(np.count_nonzero(matches.weights > 0.0))
+        doubts = np.array([motion.doubt for motion in motions if motion is not None])
+        costs = np.array([2.0 * _cost(group[0]) for group in groups])
+        first = int(np.argmin(log_cost(costs, m) + doubts))
     best = groups[first][0]
     noise_px = cases[first].noise * matches.frame.scale
     bound = minima[first].cost + 0.5 * AMBIGUOUS * noise_px**2
@@ -211,7 +215,7 @@ def chosen(matches: Matches, options: Options, found: list[Solution]) -> Search:
 
 
 def _motion(matches: Matches, options: Options, solution: Solution) -> Motion | None:
-    """Return the motion of calibrated cameras, with the cost of points in front of both."""
+    """Return the motion of calibrated cameras."""
     if options.calibration is None:
         return None
     loss = options.scaled_loss(solution.loss_scale_px / matches.frame.scale)
@@ -224,7 +228,8 @@ def _motion(matches: Matches, options: Options, solution: Solution) -> Motion | 
         solution.F,
         reprojection.corrected(feet)[:2],
         feet.squared,
-        lambda squared: 0.5 * loss(squared)[0] @ matches.weights,
+        matches.weights,
+        residual_noise(feet.signed, matches.weights, loss, 5) ** 2,
         unit2,
     )
 

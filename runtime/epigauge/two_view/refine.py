@@ -42,7 +42,7 @@ from epigauge.two_view.parameterizations import (
 from epigauge.two_view.result import FundamentalResult
 from epigauge.two_view.solve import DAMPINGS, REDUNDANT, Matches, Options
 
-__all__ = ["refine_fundamental"]
+__all__ = ["calibrations", "refine_fundamental"]
 
 Array = NDArray[np.float64]
 
@@ -193,7 +193,7 @@ def refine_fundamental(
         result = _express(x1, x2, F0, weights, plan)
         if result is not None:
             return result
-    options = replace(options, calibration=_calibration(essential, K1, K2))
+    options = replace(options, calibration=calibrations(essential, K1, K2))
     least = 8 if options.calibration is None else 5
     x1, x2 = as_matches(x1, x2, at_least=least, general_position=True)
     _check_combination(options)
@@ -317,7 +317,7 @@ def _parts(fix: str | Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(as_choice("fix", name, Ortho.parts) for name in names))
 
 
-def _calibration(
+def calibrations(
     essential: bool, K1: ArrayLike | None, K2: ArrayLike | None
 ) -> tuple[Array, Array] | None:
     """Return both calibration matrices, or None where F is not restricted."""

@@ -21,9 +21,10 @@ from epigauge.two_view.chance import CEILING
 from epigauge.two_view.conditioning import RMS, condition
 from epigauge.two_view.consensus import RANGE, Agreement, Consensus
 from epigauge.two_view.copies import earliest
+from epigauge.two_view.essential_consensus import EssentialConsensus
 from epigauge.two_view.initial import fundamental_8point
 from epigauge.two_view.losses import robust_scale
-from epigauge.two_view.refine import refine_fundamental
+from epigauge.two_view.refine import calibrations, refine_fundamental
 from epigauge.two_view.result import FundamentalResult
 
 __all__ = ["RobustResult", "estimate_fundamental"]
@@ -98,7 +99,8 @@ def estimate_fundamental(
     Parameters
     ----------
     x1, x2 : array_like, shape (m, 2)
-        At least eight different matches in pixels; exact duplicates count once.
+        At least eight different matches in pixels, five with ``essential=True``; exact duplicates
+        count once.
     robust : {"auto", "poselib", "opencv"}
         The front end: PoseLib's LO-RANSAC or OpenCV's USAC_MAGSAC. "auto" starts from both, where
         both are installed.
@@ -131,7 +133,9 @@ def estimate_fundamental(
     estimates of random subsets of the inliers, until that finds nothing higher. Matches that
     violate the oriented epipolar constraint count as wrong.
     """
-    x1, x2 = as_matches(x1, x2, general_position=True)
+    calibration = calibrations(*(options.get(name) for name in ("essential", "K1", "K2")))
+    least = 8 if calibration is None else 5
+    x1, x2 = as_matches(x1, x2, at_least=least, general_position=True)
     names = _front_ends(robust)
     seed = as_count("seed", seed, at_least=0)
     threshold = None if threshold_px == "auto" else as_positive("threshold_px", threshold_px)
@@ -146,7 +150,11 @@ def estimate_fundamental(
     y1, y2 = x1[rows], x2[rows]
 
     frame = condition(y1, y2)
-    consensus = Consensus(kernels.table(options.get("backend")), *frame.forward(y1, y2))
+    table, q = kernels.table(options.get("backend")), frame.forward(y1, y2)
+    consensus = Consensus(table, *q)
+    if calibration is not None:
+        maps = zip(frame.maps_from_pixels(), calibration, strict=True)
+        consensus = EssentialConsensus(table, *q, *(to_units @ K for to_units, K in maps))
     thresholds = _THRESHOLDS if threshold is None else (threshold / frame.scale,)
     starts = _starts(consensus, names, thresholds, seed)
     name = max(starts, key=lambda start: start[1].score)[0]
@@ -157,9 +165,9 @@ def estimate_fundamental(
     inlier = agreement.inliers(limit)
     fitted: set[bytes] = set()
     while inlier.tobytes() not in fitted and len(fitted) < _ROUNDS:
-        if np.count_nonzero(inlier) < 8:
+        if np.count_nonzero(inlier) < least:
             raise ArgumentError(
-                "x1, x2", "agree on no epipolar geometry", "at least 8 matches that do"
+                "x1, x2", "agree on no epipolar geometry", f"at least {least} matches that do"
             )
         fitted.add(inlier.tobytes())
         used, limit_px = inlier, limit * frame.scale

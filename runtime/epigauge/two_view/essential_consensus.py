@@ -1,0 +1,78 @@
+"""The essential matrix that most matches agree on, among matches with gross errors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.kernels import Table
+from epigauge.two_view.consensus import Agreement, Consensus
+from epigauge.two_view.essential import Calibrated, Essential
+from epigauge.two_view.five_point import essential_starts
+from epigauge.two_view.parameterizations import Remapped
+
+__all__ = ["EssentialConsensus"]
+
+Array = NDArray[np.float64]
+
+#: How many of the front ends' geometries give pools of right matches, how many essential matrices
+#: are taken from each, the best of which are climbed from, and rounds of looking for a better one
+#: among the matches that agree.
+_POOLS, _EACH, _CLIMBERS = 2, 5, 2
+_ROUNDS = 3
+
+#: An improvement of the likelihood that is worth another round.
+_CLIMBED = 1e-3
+
+
+class EssentialConsensus(Consensus):
+    """Search for the essential matrix with the best agreement of given matches.
+
+    Geometries of uncalibrated front ends only tell which matches may be right. Where perspective
+    hardly shows, or on a plane, the essential matrix nearest to a good F explains nothing;
+    solutions of five matches do.
+
+    Parameters
+    ----------
+    kernels : Table
+        Backend.
+    q1, q2 : ndarray, shape (2, m)
+        Conditioned matches.
+    A1, A2 : ndarray, shape (3, 3)
+        Maps of the images from rays to these coordinates.
+    """
+
+    def __init__(self, kernels: Table, q1: Array, q2: Array, A1: Array, A2: Array) -> None:
+        super().__init__(kernels, q1, q2)
+        self.cameras = Calibrated(q1, q2, A1, A2)
+        self.chart = Remapped(Essential(kernels, self.cameras.rays(q1, q2)), A1, A2)
+
+    def search(self, starts: Iterable[Agreement], rng: np.random.Generator) -> Agreement:
+        """Climb from what five of the matches that agree with a start lead to."""
+        ranked = sorted(starts, key=lambda start: -start.score)[:_POOLS]
+        pools = [(start, start.inliers(3.0 * start.sigma)) for start in ranked]
+        pools.append((ranked[0], np.ones(self.cameras.q1.shape[1], dtype=np.bool_)))
+        best = max((a for pool in pools for a in self._from(*pool)), key=lambda a: a.score)
+        for _ in range(_ROUNDS):
+            found = max(self._from(best, best.inliers(3.0 * best.sigma)), key=lambda a: a.score)
+            if found.score <= best.score + _CLIMBED:
+                break
+            best = found
+        return best
+
+    def _from(self, start: Agreement, pool: NDArray[np.bool_]) -> list[Agreement]:
+        """Return agreements climbed to from subsets of a pool, and from the start itself."""
+        essential = self.judge(self.nearest(start.F), start.sigma, start.share)
+        begun = [essential]
+        if np.count_nonzero(pool) >= Essential.dimension:
+            some = self.cameras.some(pool)
+            candidates = essential_starts(some, np.ones(some.q1.shape[1]), _EACH, robust=True)
+            begun += [self.judge(F, start.sigma, start.share) for F in candidates]
+        begun.sort(key=lambda agreement: -agreement.score)
+        return [self.climb(agreement) for agreement in begun[:_CLIMBERS]]
+
+    def nearest(self, F: Array) -> Array:
+        """Return the essential matrix nearest to an F, in the coordinates of the matches."""
+        return self.chart.fundamental(self.chart.start(F))
