@@ -182,9 +182,9 @@ class Sandwich:
         for Z, C in self._parts():
             first = Z[:size].reshape(size, -1)
             second = Z[size:].reshape(len(points), 4, -1)
-            middle = np.zeros((len(C), 2, len(C), 2))
-            middle[np.arange(len(C)), :, np.arange(len(C))] = C
-            middle = middle.reshape(2 * len(C), -1)
+            blocks = np.zeros((len(C), 2, len(C), 2))
+            blocks[np.arange(len(C)), :, np.arange(len(C))] = C
+            middle = blocks.reshape(2 * len(C), -1)
             cameras += first @ middle @ first.T
             points += second @ middle @ np.swapaxes(second, 1, 2)
             seen = J_camera @ first.reshape(layout.n_views, 12, -1)[layout.view]

@@ -133,7 +133,9 @@ def estimate_fundamental(
     estimates of random subsets of the inliers, until that finds nothing higher. Matches that
     violate the oriented epipolar constraint count as wrong.
     """
-    calibration = calibrations(*(options.get(name) for name in ("essential", "K1", "K2")))
+    calibration = calibrations(
+        bool(options.get("essential", False)), options.get("K1"), options.get("K2")
+    )
     least = 8 if calibration is None else 5
     x1, x2 = as_matches(x1, x2, at_least=least, general_position=True)
     names = _front_ends(robust)
