@@ -48,14 +48,17 @@ def disturbed(scene, rng, refined):
 @pytest.mark.parametrize("name", METRIC)
 def test_exact_images_lead_back_to_the_scene(name):
     tracks, scene = network(name, 1)
-    start = disturbed(scene, np.random.default_rng(2), len(models()[name].adjusted))
-    result = eg.bundle_adjust(tracks, start)
+    refined = models()[name].adjusted
+    if name == "FULL_OPENCV":  # whose last coefficients nearly replace the others
+        refined = tuple(p for p in refined if p not in ("k3", "k4", "k5", "k6"))
+    start = disturbed(scene, np.random.default_rng(2), len(refined))
+    result = eg.bundle_adjust(tracks, start, refine=refined or "pose")
     assert result.success, result.message
     assert result.reconstruction.rms_px(tracks) <= 1e-9 < 1e-3 < start.rms_px(tracks)
     found = result.reconstruction.cameras.params
     constant = len(models()[name].adjusted)
     np.testing.assert_array_equal(found[:, constant:], scene.cameras.params[:, constant:])
-    if name not in ("FULL_OPENCV", "brown"):  # whose coefficients nearly replace each other
+    if name != "brown":  # whose A1 to A3 nearly replace each other
         assert distance(found, scene.cameras.params) <= 1e-5
 
 

@@ -218,7 +218,7 @@ def _named(system: BundleSystem, deviations: Array) -> tuple[str, float]:
     """Return the largest standard deviations of a direction by name, as shares of their sizes.
 
     Turns are in radians, moves as shares of the median distance of the points, focal lengths and
-    other parameters in pixels as shares of the focal length; those without unit count for nothing.
+    other parameters in their unit as shares of the focal length; all others count for nothing.
     """
     model, cameras = system.model, system.cameras
     pose = cameras[:, :12].reshape(-1, 3, 4)
@@ -228,7 +228,8 @@ def _named(system: BundleSystem, deviations: Array) -> tuple[str, float]:
     sizes[:, 3:6] = max(float(extent), 1e-300)
     focal = cameras[:, 12:][:, list(model.focal)]
     sizes[:, 6:] = focal.mean(axis=1, keepdims=True) if focal.size else np.inf
-    without = [k for k, unit in enumerate(model.units) if unit != "px"]
+    of_image = {model.units[k] for k in model.focal}
+    without = [k for k in range(len(model.adjusted)) if model.units[k] not in of_image]
     sizes[:, [6 + k for k in without]] = np.inf
     shares = deviations / sizes
     views, entries = np.unravel_index(np.argsort(-shares, axis=None)[:3], shares.shape)
