@@ -32,6 +32,7 @@ import colmap_databases
 import epigauge as eg
 import numpy as np
 from epigauge.cli import app
+from metric_scenes import metric_scene
 from typer.testing import CliRunner
 
 Random = np.random.Generator
@@ -115,7 +116,11 @@ def renumbered(data: bytes, random: Random) -> bytes:
     found = list(_NUMBER.finditer(data))
     changed = bytearray(data)
     for k in sorted(random.integers(0, len(found), random.integers(1, 4)), reverse=True):
-        choice = _WORDS[random.integers(10)] if random.integers(2) else found[k - 7].group()
+        choice = (
+            _WORDS[random.integers(10)]
+            if random.integers(2)
+            else found[(k - 7) % len(found)].group()
+        )
         changed[slice(*found[k].span())] = choice
     return bytes(changed)
 
@@ -249,7 +254,13 @@ def kinds() -> dict[str, Kind]:
                 ("bundle FILE", "bundle FILE --start FILE", "bundle FILE --json"),
                 (rearchived,),
             ),
-            Kind("b.txt", saved("b.txt", of_bal), ("bundle FILE --start FILE",), text),
+            Kind(
+                "b.txt",
+                saved("b.txt", of_bal),
+                ("bundle FILE --start FILE", "bundle FILE --refine pose"),
+                text,
+            ),
+            *scenes(Path(folder)),
             *(
                 Kind(
                     f"b.txt.{name}",
@@ -276,6 +287,22 @@ def kinds() -> dict[str, Kind]:
     return {kind.name: kind for kind in found}
 
 
+def scenes(folder: Path) -> Iterator[Kind]:
+    """Yield the files of COLMAP folders, each damaged while the others are good, and NPZ."""
+    scene = metric_scene("SIMPLE_RADIAL", 5, n_points=12, noise_px=0.5)
+    command = ("bundle FOLDER --refine pose",)
+    for form, text in (("bin", False), ("txt", True)):
+        eg.save_scene(folder / form, *scene, text=text)
+        good = {path.name: path.read_bytes() for path in (folder / form).iterdir()}
+        for name, data in good.items():
+            others = {other: content for other, content in good.items() if other != name}
+            inner = (renumbered, relined) if text else ()
+            yield Kind(name, data, command, inner, others)
+    eg.save_scene(folder / "s.npz", *scene)
+    whole = (folder / "s.npz").read_bytes()
+    yield Kind("s.npz", whole, ("bundle FILE --refine pose",), (rearchived,))
+
+
 def run(kind: Kind, data: bytes, command: str, folder: Path) -> Outcome:
     """Run a command on an input and judge what it does."""
     folder /= kind.name.replace(".", "-")
@@ -284,6 +311,7 @@ def run(kind: Kind, data: bytes, command: str, folder: Path) -> Outcome:
         (folder / name).write_bytes(content)
     arguments = command.replace("FILE", kind.name).split()
     arguments = [str(folder / a) if (folder / a).is_file() else a for a in arguments]
+    arguments = [str(folder) if a == "FOLDER" else a for a in arguments]
     begin = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # NumPy's would be noise on stderr

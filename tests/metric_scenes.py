@@ -30,6 +30,13 @@ def parameters(model: str, count: int, rng: np.random.Generator) -> NDArray[np.f
     return rows
 
 
+def looks_along(model: str) -> float:
+    """Return 1 for cameras that look along z, -1 for those along -z, as of BAL."""
+    known = camera_model(model)
+    camera = np.concatenate([np.eye(3, 4).ravel(), np.ones(len(known.params))])
+    return 1.0 if known.kernel("project")(camera, np.array([0.0, 0.0, 1.0]))[1] > 0.0 else -1.0
+
+
 def metric_scene(
     model: str,
     seed: int = 0,
@@ -42,14 +49,14 @@ def metric_scene(
 ) -> tuple[eg.Tracks, eg.MetricReconstruction]:
     """Return cameras on a circle that look at points in its middle, and what they see."""
     rng = np.random.default_rng(seed)
-    behind = -1.0 if model == "bal" else 1.0  # BAL's cameras look along -z
+    along = looks_along(model)
     X = rng.uniform(-1.0, 1.0, (n_points, 3))
     R, t = np.empty((n_views, 3, 3)), np.empty((n_views, 3))
     for i in range(n_views):
         angle = 2.0 * np.pi * i / n_views + rng.uniform(-0.1, 0.1)
         z = -np.array([np.cos(angle), rng.uniform(-0.2, 0.2), np.sin(angle)])
         centre = -6.0 * z / np.linalg.norm(z)
-        z *= behind / np.linalg.norm(z)
+        z *= along / np.linalg.norm(z)
         x = np.cross([rng.uniform(-0.2, 0.2), 1.0, 0.0], z)
         x /= np.linalg.norm(x)
         R[i] = [x, np.cross(z, x), z]

@@ -9,7 +9,7 @@ import epigauge as eg
 import numpy as np
 import pytest
 from epigauge.cameras import models
-from metric_scenes import METRIC, metric_scene, parameters
+from metric_scenes import METRIC, looks_along, metric_scene, parameters
 
 GOOD: dict[str, Any] = {
     "model": "SIMPLE_RADIAL",
@@ -127,7 +127,7 @@ def test_images_do_not_change_with_the_similarity_of_space(model: str) -> None:
 def test_the_projective_scene_is_the_scene_near_the_optical_axes(model: str) -> None:
     tracks, scene = metric_scene(model, seed=5)
     # A point on each axis, at any distance, and one beside it.
-    sign = -1.0 if model == "bal" else 1.0
+    sign = looks_along(model)
     for aside, atol in ((0.0, 1e-9), (1e-4, 1e-7)):
         h = sign * np.array([aside, -aside, 1.0]) * 3.0
         X = np.einsum("nji,nj->ni", scene.R, h - scene.t)

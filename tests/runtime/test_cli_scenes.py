@@ -14,6 +14,7 @@ pytest.importorskip("typer", reason="the command line needs typer")
 pytest.importorskip("rich", reason="the command line needs rich")
 
 from epigauge.__main__ import main
+from epigauge.reproduce.gauges_metric import LABELS
 from metric_scenes import metric_scene
 
 
@@ -152,6 +153,9 @@ def test_compare_puts_methods_side_by_side(run, folder) -> None:
     assert found["start_rms_px"] == start.rms_px(tracks)
     wanted = eg.bundle_adjust(tracks, start, refine=("f",))
     assert [row["cost"] for row in found["rows"]] == [wanted.cost]
+    code, out, _ = run("compare", folder, "--max-iter", "1", "--json")
+    methods = [row["method"] for row in json.loads(out)["rows"]]
+    assert methods == list(LABELS)
 
 
 def test_rigs_are_given_up_only_on_request(run, tmp_path) -> None:

@@ -335,7 +335,7 @@ BAD = (
         "images",
         r"\n1 (\S+) (\S+) (\S+) (\S+)",
         "\n1 0 0 0 0",
-        "line 2: has a quaternion of length 0",
+        "line 2: has a quaternion of size 0",
     ),
     ("images", r"\n1 \S+", "\n1 1e_1", "line 2: '1e_1' is not a number"),
     ("images", r" a.jpg", "", "line 2: ends before its name"),

@@ -37,7 +37,7 @@ REFINEMENT_METRIC = PointRefinement(lam=1e-4)
 _ROUNDING = 1e-14
 
 #: Dampings, and methods, of projective cameras only.
-_PROJECTIVE = ("gauge_invariant", "gauge_invariant_factor")
+PROJECTIVE_ONLY = ("gauge_invariant", "gauge_invariant_factor")
 
 
 def bundle_problem(
@@ -125,7 +125,7 @@ def minimized(
     """
     strategy = STRATEGIES[method]
     name = strategy.damping if damping is None else damping
-    if name in _PROJECTIVE and not job.model.homogeneous:
+    if name in PROJECTIVE_ONLY and not job.model.homogeneous:
         what = "damping" if damping else "method"
         needed = "a projective start, or another method"
         raise ArgumentError(what, f"is {name!r} for {job.model.name} cameras", needed)

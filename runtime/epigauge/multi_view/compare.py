@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from epigauge import lm
 from epigauge._arguments import as_choice
+from epigauge.bundle.run import PROJECTIVE_ONLY
 from epigauge.bundle.strategies import STRATEGIES
 from epigauge.cameras import MetricReconstruction
 from epigauge.errors import ArgumentError
@@ -129,7 +130,10 @@ def compare(
     ArgumentError
         On unknown or repeated names, and as `bundle_adjust`.
     """
-    names = list(STRATEGIES) if methods == "all" else methods
+    names = methods
+    if methods == "all":
+        metric = isinstance(start, MetricReconstruction)
+        names = [name for name in STRATEGIES if not (metric and name in PROJECTIVE_ONLY)]
     if isinstance(names, str) or not names or len(set(names)) != len(names):
         raise ArgumentError("methods", f"is {methods!r}", '"all" or a list of different names')
     for name in names:
