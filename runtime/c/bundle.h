@@ -116,9 +116,6 @@ EG_EXPORT void eg_bundle_pair_blocks(
 EG_EXPORT int eg_bundle_whiten(
     ptrdiff_t n, const double *U, const double *W, double lam, double *A, double *white);
 
-EG_EXPORT void eg_bundle_reduce(
-    const eg_envelope *envelope, const double *pairs, const double *U, const double *A, double *S);
-
 EG_EXPORT void eg_bundle_neighbours(const eg_bundle *bundle, unsigned char *together);
 
 /* ---------------------------------------------------------------- bundle_start.c */
@@ -136,11 +133,23 @@ EG_EXPORT int eg_resect(
     ptrdiff_t count, const double *q, const double *Q, double scale2, double ftol,
     ptrdiff_t max_iter, double *P);
 
-/* ---------------------------------------------------------------- bundle_step.c */
+/* ---------------------------------------------------------------- bundle_minimize.c */
 
-EG_EXPORT int eg_bundle_step(
-    const eg_bundle *bundle, const eg_envelope *envelope, const double *P, const double *Q,
-    const double *U, const double *V, const double *g_cameras, const double *g_points,
-    const double *W_cameras, const double *W_points, double lam, double *step, double *energy);
+/* How cameras and points are minimised over, all of them free. */
+typedef struct {
+    eg_refinement refinement;
+    double ftol, xtol, gtol;
+    double start, least;    /* first lambda, and the least relative to it */
+    double floor;           /* a cost this low is rounding error */
+    ptrdiff_t max_iter;
+    const int32_t *focal;   /* places of focal lengths in a stored camera */
+    ptrdiff_t focals;
+    double min_focal, max_focal;
+} eg_bundle_options;
+
+EG_EXPORT int eg_bundle_minimize(
+    const eg_bundle *bundle, const eg_envelope *views, const eg_envelope *panels,
+    const eg_bundle_options *options, double *cameras, double *points, double *history,
+    double *cost, ptrdiff_t *counts);
 
 #endif

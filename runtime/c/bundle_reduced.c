@@ -95,34 +95,6 @@ int eg_bundle_whiten(
     return 0;
 }
 
-/* S = U - A^T (sums of pairs) A, block by block; U (n, 12, 12), A (n, 12, 12) or NULL for I. */
-void eg_bundle_reduce(
-    const eg_envelope *envelope, const double *pairs, const double *U, const double *A, double *S)
-{
-    double raw[BLOCK], half[BLOCK];
-    for (ptrdiff_t row = 0; row < envelope->n; ++row) {
-        for (ptrdiff_t column = envelope->first[row]; column <= row; ++column, S += BLOCK) {
-            const ptrdiff_t slot = envelope->slot[row] + column - envelope->first[row];
-            const double *pair = pairs + EG_PAIR * slot;
-            double *to = A ? raw : S;
-            for (int q = 0; q < 3; ++q)
-                for (int l = 0; l < 4; ++l)
-                    for (int p = 0; p < 3; ++p)
-                        for (int k = 0; k < 4; ++k)
-                            to[ROWS * (4 * q + l) + 4 * p + k] =
-                                -pair[EG_ENTRY(9, 3 * q + p, moment_of[k][l])];
-            if (A) { /* half = (sums) A, row by row; S = -A^T half. */
-                memset(half, 0, sizeof half);
-                memset(S, 0, sizeof half);
-                subtract_product(ROWS, A + BLOCK * column, raw, half);
-                subtract_product(ROWS, A + BLOCK * row, half, S);
-            }
-            for (int k = 0; row == column && k < BLOCK; ++k)
-                S[k] += U[BLOCK * row + k];
-        }
-    }
-}
-
 /* together[i n + k] = 1 where views i and k share a point. */
 void eg_bundle_neighbours(const eg_bundle *bundle, unsigned char *together)
 {

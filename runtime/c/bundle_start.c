@@ -3,6 +3,7 @@
 
 #include "bundle_chunk.h"
 #include "bundle_moments.h"
+#include "lm.h"
 #include "skyline.h"
 #include "small.h"
 
@@ -184,51 +185,62 @@ static double largest(ptrdiff_t n, const double *values, ptrdiff_t stride)
     return result;
 }
 
-/* Minimise from a camera, which is updated, by damping lambda I as epigauge.lm.minimize does. */
-static void resect(const resection *r, double ftol, int max_iter, double *P)
+/* A minimisation over one camera: the estimate, a trial, normal equations. */
+typedef struct {
+    const resection *r;
+    double *P, trial[12], N[144], g[12];
+} one_camera;
+
+static double cost_at_start(void *self)
 {
-    static const eg_bundle one = {.n_views = 1, .model = -1};
+    one_camera *own = self;
+    return resection_cost(own->r, own->P, NULL);
+}
+
+static eg_lm_system linearize(void *self)
+{
+    static const eg_bundle one = {.n_views = 1, .model = EG_FACTORED};
+    one_camera *own = self;
+    double sums[EG_CAMERA], depth[144];
+    resection_cost(own->r, own->P, sums);
+    eg_bundle_camera_blocks(&one, sums, own->N, depth, own->g);
+    const eg_lm_system system = {largest(12, own->g, 1), largest(12, own->N, 13), INFINITY};
+    return system;
+}
+
+static int make_step(void *self, double lam, double *norm)
+{
     static const int32_t first[1] = {0};
     static const ptrdiff_t slot[2] = {0, 1};
     const eg_envelope alone = {1, first, slot};
-    double sums[EG_CAMERA], N[144], depth[144], g[12], damped[144], step[12], trial[12];
-    double cost = resection_cost(r, P, sums), lam = 0.0;
-    for (int iteration = 0; cost > 0.0 && cost < INFINITY;) {
-        double after, norm = 0.0;
-        eg_bundle_camera_blocks(&one, sums, N, depth, g);
-        const double size = largest(12, N, 13);
-        if (lam == 0.0)
-            lam = 1e-3 * fmax(size, 1e-300);
-        if (largest(12, g, 1) <= 1e-14)
-            return;
-        for (;; lam *= 10.0) {
-            if (iteration >= max_iter || lam > 1e16 * fmax(size, 1e-300))
-                return;
-            memcpy(damped, N, sizeof N);
-            for (int k = 0; k < 12; ++k) {
-                damped[13 * k] += lam;
-                step[k] = -g[k];
-            }
-            if (eg_envelope_factor(&alone, damped))
-                continue;
-            eg_envelope_solve(&alone, damped, 1, step);
-            for (int k = 0; k < 12; ++k)
-                trial[k] = P[k] + step[k];
-            ++iteration;
-            after = resection_cost(r, trial, NULL);
-            if (after < cost)
-                break;
-            if (fabs(cost - after) <= 1e-15 * cost)
-                return;
-        }
-        for (int k = 0; k < 12; ++k)
-            norm += step[k] * step[k];
-        memcpy(P, trial, sizeof trial);
-        lam /= 10.0;
-        if (cost - after <= ftol * after || norm <= 1e-24)
-            return;
-        cost = resection_cost(r, P, sums);
+    one_camera *own = self;
+    double damped[144], step[12], sum = 0.0;
+    memcpy(damped, own->N, sizeof damped);
+    for (int k = 0; k < 12; ++k) {
+        damped[13 * k] += lam;
+        step[k] = -own->g[k];
     }
+    if (eg_envelope_factor(&alone, damped))
+        return EG_STEP_SINGULAR;
+    eg_envelope_solve(&alone, damped, 1, step);
+    for (int k = 0; k < 12; ++k) {
+        own->trial[k] = own->P[k] + step[k];
+        sum += step[k] * step[k];
+    }
+    *norm = sqrt(sum);
+    return EG_STEP_MADE;
+}
+
+static double cost_at_trial(void *self)
+{
+    one_camera *own = self;
+    return resection_cost(own->r, own->trial, NULL);
+}
+
+static void accept(void *self)
+{
+    one_camera *own = self;
+    memcpy(own->P, own->trial, sizeof own->trial);
 }
 
 /* The camera (3, 4) of least Cauchy loss, of squared scale `scale2`, for measurements (2, count) of
@@ -250,7 +262,12 @@ int eg_resect(ptrdiff_t count, const double *q, const double *Q, double scale2, 
     }
     for (ptrdiff_t begin = 0; begin < padded; begin += BATCH)
         eg_moments(BATCH, r.points + 4 * begin, r.moments + 16 * begin);
-    resect(&r, ftol, (int)max_iter, P);
+    one_camera own = {.r = &r, .P = P};
+    const eg_lm_problem problem = {&own, 0.0, cost_at_start, linearize, make_step, cost_at_trial,
+                                   accept};
+    const eg_lm_options how = {ftol, 1e-12, 1e-14, 1e-3, 1e-8, 1, (int)max_iter};
+    eg_lm_outcome outcome;
+    eg_lm(&problem, &how, NULL, &outcome);
     free(memory);
     return 0;
 }

@@ -1,38 +1,22 @@
-/* The Levenberg-Marquardt loop over F: lm.py, linear.py and eliminated.py for at most seven unknowns.
+/* Minimisation over F: linear.py and eliminated.py for at most seven unknowns.
 
    Statuses, stopping rules and the rows of the history are those of runtime/epigauge/lm.py. */
-#define _POSIX_C_SOURCE 199309L
-
+#include "lm.h"
 #include "small.h"
 #include "two_view.h"
 
 #include <float.h>
 #include <math.h>
 #include <string.h>
-#include <time.h>
 
 /* As in lm.py and linear.py. */
-#define LAM_CEILING 1e16
-#define LAM_FACTOR 10.0
 #define LAM_FLOOR 1e-11
 #define LAM_START 1e-3
 #define LIFT 1e-3
 #define BENT (0.375 * 0.375)
-#define TINIEST 1e-300
 
 /* Cholesky pivots above this ratio prove a condition far below that of a singular matrix. */
 #define WELL_CONDITIONED 1e-8
-
-static double now(void)
-{
-#ifdef CLOCK_MONOTONIC
-    struct timespec moment;
-    clock_gettime(CLOCK_MONOTONIC, &moment);
-    return (double)moment.tv_sec + 1e-9 * (double)moment.tv_nsec;
-#else
-    return (double)clock() / CLOCKS_PER_SEC;
-#endif
-}
 
 /* Parameters of the representation itself, before a basis selects some. */
 static int own_parameters(const eg_options *options)
@@ -256,89 +240,68 @@ static void solve(const eg_outcome *state, int p, double lam, const eg_options *
         step[i] /= system.scale[i];
 }
 
-static double record(double *history, eg_outcome *outcome, double cost, double lam, double norm,
-                     int accepted, double begun)
-{
-    if (history) {
-        double *row = history + (ptrdiff_t)EG_ROW * outcome->nfev;
-        row[0] = outcome->nit;
-        row[1] = cost;
-        row[2] = lam;
-        row[3] = norm;
-        row[4] = accepted;
-        row[5] = now() - begun;
-    }
-    outcome->nfev += 1;
-    return cost;
-}
-
 static double cost_of(eg_matches *matches, const eg_options *options, const double *F)
 {
     const double cost = eg_distances(matches, options, F);
     return isfinite(cost) ? cost : INFINITY;
 }
 
-static int loop(eg_matches *matches, const eg_options *options, const eg_chart *chart,
-                double *motion, double *history, eg_outcome *state, double floor)
+/* A minimisation over F: the estimate, and a trial. */
+typedef struct {
+    eg_matches *matches;
+    const eg_options *options;
+    const eg_chart *chart;
+    double *motion, moved[EG_MOTION], F[9];
+    eg_outcome *state;
+} minimization;
+
+static double cost_at_start(void *self)
 {
-    const double begun = history ? now() : 0.0;
-    const int p = chart->p;
-    fundamental(options, chart, motion, state->F);
-    state->cost = record(history, state, cost_of(matches, options, state->F), 0.0, 0.0, 1, begun);
-    linearize(matches, options, chart, motion, state);
-    state->njev = state->current = 1;
-    if (!isfinite(state->cost))
-        return -3;
-    double lam = options->scaled ? LAM_START : LAM_START * fmax(largest(state, p), TINIEST);
-    const double least = LAM_FLOOR * lam;
-    for (;;) {
-        double step[7], moved[EG_MOTION] = {0.0}, F[9], trial, decrease, steepest = 0.0, norm = 0.0;
-        for (int i = 0; i < p; ++i)
-            steepest = fmax(steepest, fabs(state->gradient[i]));
-        if (state->cost <= floor)
-            return 5;
-        if (steepest <= options->gtol)
-            return 1;
-        if (decrement(state, p) <= options->ftol * state->cost)
-            return 4;
-        const double ceiling = LAM_CEILING * fmax(largest(state, p), TINIEST);
-        const int solvable = all_finite(p * p, state->hessian) && all_finite(p, state->gradient);
-        for (;;) {
-            if (state->nit >= options->max_iter)
-                return 0;
-            if (!solvable)
-                return -1;
-            solve(state, p, lam, options, step);
-            state->nit += 1;
-            retract(options, chart, motion, step, moved);
-            fundamental(options, chart, moved, F);
-            trial = cost_of(matches, options, F);
-            decrease = state->cost - trial;
-            norm = 0.0;
-            for (int i = 0; i < p; ++i)
-                norm += step[i] * step[i];
-            norm = sqrt(norm);
-            record(history, state, trial, lam, norm, decrease > 0.0, begun);
-            state->current = decrease > 0.0;
-            if (decrease > 0.0)
-                break;
-            if (fabs(decrease) <= 1e-15 * state->cost)
-                return 2;
-            lam *= LAM_FACTOR;
-            if (lam > ceiling)
-                return -1;
-        }
-        lam = fmax(lam / LAM_FACTOR, least);
-        state->cost = trial;
-        memcpy(motion, moved, sizeof moved);
-        memcpy(state->F, F, sizeof F);
-        linearize(matches, options, chart, motion, state);
-        state->njev += 1;
-        if (decrease <= options->ftol * state->cost)
-            return 2;
-        if (norm <= options->xtol)
-            return 3;
-    }
+    minimization *m = self;
+    fundamental(m->options, m->chart, m->motion, m->state->F);
+    return cost_of(m->matches, m->options, m->state->F);
+}
+
+static eg_lm_system linearized(void *self)
+{
+    minimization *m = self;
+    const int p = m->chart->p;
+    eg_lm_system system = {0.0, 0.0, 0.0};
+    linearize(m->matches, m->options, m->chart, m->motion, m->state);
+    for (int i = 0; i < p; ++i)
+        system.steepest = fmax(system.steepest, fabs(m->state->gradient[i]));
+    system.size = largest(m->state, p);
+    system.decrement = decrement(m->state, p);
+    return system;
+}
+
+static int step_of(void *self, double lam, double *norm)
+{
+    minimization *m = self;
+    const int p = m->chart->p;
+    double step[7], sum = 0.0;
+    if (!all_finite(p * p, m->state->hessian) || !all_finite(p, m->state->gradient))
+        return EG_STEP_HOPELESS;
+    solve(m->state, p, lam, m->options, step);
+    retract(m->options, m->chart, m->motion, step, m->moved);
+    for (int i = 0; i < p; ++i)
+        sum += step[i] * step[i];
+    *norm = sqrt(sum);
+    return EG_STEP_MADE;
+}
+
+static double cost_at_trial(void *self)
+{
+    minimization *m = self;
+    fundamental(m->options, m->chart, m->moved, m->F);
+    return cost_of(m->matches, m->options, m->F);
+}
+
+static void accept(void *self)
+{
+    minimization *m = self;
+    memcpy(m->motion, m->moved, sizeof m->moved);
+    memcpy(m->state->F, m->F, sizeof m->F);
 }
 
 void eg_minimize(eg_matches *matches, const eg_options *options, const eg_chart *chart,
@@ -349,6 +312,18 @@ void eg_minimize(eg_matches *matches, const eg_options *options, const eg_chart 
     for (ptrdiff_t i = 0; i < matches->m; ++i)
         total += matches->weights[i];
     memset(outcome, 0, sizeof *outcome);
+    minimization own = {matches, options, chart, motion, {0.0}, {0.0}, outcome};
     /* Rounding of coordinates of size ~2 moves a distance by ~1e-15, as in eliminated.py. */
-    outcome->status = loop(matches, options, chart, motion, history, outcome, 0.5 * total * 1e-30);
+    const eg_lm_problem problem = {&own, 0.5 * total * 1e-30, cost_at_start, linearized, step_of,
+                                   cost_at_trial, accept};
+    const eg_lm_options how = {options->ftol, options->xtol, options->gtol, LAM_START, LAM_FLOOR,
+                               !options->scaled, options->max_iter};
+    eg_lm_outcome found;
+    eg_lm(&problem, &how, history, &found);
+    outcome->nfev = found.nfev;
+    outcome->njev = found.njev;
+    outcome->nit = found.nit;
+    outcome->status = found.status;
+    outcome->current = found.current;
+    outcome->cost = found.cost;
 }

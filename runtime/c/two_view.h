@@ -71,9 +71,6 @@ typedef struct {
     double F[9];
 } eg_outcome;
 
-/* iteration, cost, lambda, length of the step, accepted, seconds */
-#define EG_ROW 6
-
 /* Signed distances into matches->d (and multipliers); returns half the weighted robust sum. */
 double eg_distances(eg_matches *matches, const eg_options *options, const double *F);
 

@@ -22,6 +22,7 @@ __all__ = [
     "PANEL",
     "TRACE",
     "Bundle",
+    "BundleOptions",
     "Envelope",
     "Refinement",
     "aligned_zeros",
@@ -85,6 +86,20 @@ class Refinement(ctypes.Structure):
     )
 
 
+class BundleOptions(ctypes.Structure):
+    """The eg_bundle_options of bundle.h."""
+
+    _fields_ = (
+        ("refinement", Refinement),
+        *((name, _D) for name in ("ftol", "xtol", "gtol", "start", "least", "floor")),
+        ("max_iter", _N),
+        ("focal", _P),
+        ("focals", _N),
+        ("min_focal", _D),
+        ("max_focal", _D),
+    )
+
+
 #: The damping of a refinement: by the trace of a point's block, or by the block.
 TRACE, BLOCK = 0, 1
 
@@ -104,14 +119,12 @@ _TYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "bundle_point_steps": (_D, (_N, _N, *[_P] * 4, _N, _P)),
     "bundle_camera_blocks": (None, (_P,) * 5),
     "bundle_pair_blocks": (None, (_P, _N, _P, _P)),
-    "bundle_whiten": (_I, (_N, _P, _P, _D, _P, _P)),
-    "bundle_reduce": (None, (_P,) * 5),
     "bundle_neighbours": (None, (_P, _P)),
     "bundle_intersect": (_I, (*_RANGE, _P, _P)),
     "bundle_distances": (_I, (*_RANGE, *[_P] * 4)),
     "spreading_basis": (_I, (_N, _P, _P)),
     "resect": (_I, (_N, _P, _P, _D, _D, _N, _P)),
-    "bundle_step": (_I, (*[_P] * 10, _D, _P, _P)),
+    "bundle_minimize": (_I, (_P,) * 9),
     "envelope_factor": (_I, (_P, _P)),
     "envelope_solve": (None, (_P, _P, _N, _P)),
     "skyline_reduce": (None, (_P, _P, _N, _N, _P, _N, _N, _P, _P, _P)),

@@ -31,6 +31,7 @@ __all__ = [
     "Stopping",
     "System",
     "minimize",
+    "rows",
 ]
 
 Array = NDArray[np.float64]
@@ -240,6 +241,14 @@ class Outcome(Generic[S]):
     history: tuple[Row, ...]
 
 
+def rows(history: Array, scale: float) -> tuple[Row, ...]:
+    """Return the history of a compiled loop, (k, 6), as rows; costs are multiplied by `scale`."""
+    return tuple(
+        Row(int(iteration), cost * scale, lam, norm, accepted == 1.0, seconds)
+        for iteration, cost, lam, norm, accepted, seconds in history.tolist()
+    )
+
+
 def minimize(
     problem: Problem[S],
     start: Any,
@@ -251,6 +260,9 @@ def minimize(
     lam_floor: float = _LAM_FLOOR,
 ) -> Outcome[S]:
     """Minimise a cost by damped steps.
+
+    A problem may have a method `compiled` that runs the same loop in C; it returns None where that
+    does not know all parts.
 
     Parameters
     ----------
@@ -288,6 +300,12 @@ def minimize(
     - ``c <= problem.floor`` (5), or a step neither lowers nor raises the cost beyond
       ``1e-15 * c`` (2): then rounding decides.
     """
+    compiled = getattr(problem, "compiled", None)
+    if compiled is not None and callback is None:
+        done = compiled(start, damping, schedule, stopping, scale, lam_floor)
+        if done is not None:
+            found: Outcome[S] = done
+            return found
     begun = time.perf_counter()
     state = problem.evaluate(start)
     history: list[Row] = []

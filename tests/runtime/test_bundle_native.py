@@ -380,7 +380,7 @@ class TestThreads:
 
     @staticmethod
     def laid(parts: dict[str, Any]) -> LaneLayout:
-        return both("projective", parts)[0]._layout
+        return both("projective", parts)[0].layout
 
     def test_shares_cover_all_chunks_once(self) -> None:
         laid = self.laid(scene_of("projective", 12, 300, 0.3)[0])

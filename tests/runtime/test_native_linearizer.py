@@ -6,13 +6,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from epigauge import kernels
+from epigauge import kernels, lm
 from epigauge.bundle import lanes
+from epigauge.bundle.dampings import Covariant, Levenberg
+from epigauge.bundle.freedom import Freedom
 from epigauge.bundle.linearizer import Linearizer, PointRefinement, point_damping
 from epigauge.bundle.native_linearizer import NativeLinearizer
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.problem import Estimate
+from epigauge.bundle.run import bundle_problem
 from epigauge.bundle.skyline import Skyline, narrow
+from epigauge.bundle.ties import Ties
 from epigauge.cameras import CameraModel, camera_model, models
 from epigauge.two_view.losses import LOSSES, Loss
 from laws import distance
@@ -308,3 +313,56 @@ class TestSkyline:
         held = np.zeros((n, n), np.bool_)
         held[rows, columns] = held[columns, rows] = True
         assert (held | ~together[np.ix_(order, order)]).all()
+
+
+class TestCompiledLoop:
+    @pytest.mark.parametrize("name", ["projective", "bal", "OPENCV"])
+    @pytest.mark.parametrize("loss", ["linear", "cauchy"])
+    def test_it_takes_the_steps_of_the_readable_one(self, name: str, loss: str) -> None:
+        at = scene(name, 5, 60, 0.8)
+        problem = bundle_problem(
+            at.model,
+            kernels.table("c"),
+            at.graph,
+            at.q,
+            at.weights,
+            at.loss(loss),
+            embedded=True,
+            freedom=Freedom(),
+        )
+        stopping = lm.Stopping(ftol=1e-6, xtol=0.0, gtol=0.0, max_iter=30)
+        start = Estimate(at.cameras, at.points)
+        parts = start, Covariant(), lm.Classic(), stopping
+        short = problem.compiled(*parts, 2.0, 1e-8)
+        long = lm.minimize(problem, *parts, lambda _: False, 2.0)
+        assert short is not None
+        assert (short.nfev, short.njev, short.nit) == (long.nfev, long.njev, long.nit)
+        assert short.status == long.status
+        assert len(short.history) == short.nfev > 2
+        for x, y in zip(short.history, long.history, strict=True):
+            assert (x.iteration, x.accepted) == (y.iteration, y.accepted)
+            assert x.cost == pytest.approx(y.cost, rel=1e-7)
+            assert x.lam == pytest.approx(y.lam, rel=1e-12)
+            assert x.step_norm == pytest.approx(y.step_norm, rel=1e-4)
+        evaluated = problem.evaluate(short.state.estimate).cost
+        assert short.state.cost == pytest.approx(evaluated, rel=1e-12)
+        assert short.state.estimate.steps == long.state.estimate.steps
+
+    def test_what_it_does_not_know_is_left_to_the_readable_one(self) -> None:
+        at = scene("bal", 5, 60, 0.8)
+        table, loss = kernels.table("c"), at.loss("linear")
+        stopping, start = lm.Stopping(max_iter=3), Estimate(at.cameras, at.points)
+
+        def compiled(damping: Any, schedule: Any, *, embedded: bool = True, **parts: Any) -> Any:
+            own = at.model, table, at.graph, at.q, at.weights, loss
+            problem = bundle_problem(*own, embedded=embedded, **parts)
+            return problem.compiled(start, damping, schedule, stopping, 1.0, 1e-8)
+
+        assert compiled(Covariant(), lm.Classic()) is not None
+        assert compiled(Levenberg(), lm.Classic()) is None
+        assert compiled(Covariant(), lm.Nielsen()) is None
+        assert compiled(Covariant(), lm.Classic(), embedded=False) is None
+        kept = Freedom(kept=np.ones(60, np.bool_))
+        assert compiled(Covariant(), lm.Classic(), freedom=kept) is None
+        fixed = Freedom(Ties(A=np.tile(np.eye(9)[:, :8], (5, 1, 1)) * 2.0))
+        assert compiled(Covariant(), lm.Classic(), freedom=fixed) is None

@@ -95,16 +95,21 @@ class NativeLinearizer:
             )
         #: None where all entries are computed with.
         self._used: Indices | None = None if len(used) == len(whole) else used
-        self._layout = LaneLayout(graph, q, weights, row, used.astype(np.int32))
-        self._bundle = self._layout.bundle(loss)
+        self.layout = LaneLayout(graph, q, weights, row, used.astype(np.int32))
+        self._bundle = self.layout.bundle(loss)
         self.reference = ctypes.byref(self._bundle)
         widths = np.zeros(3, np.intp)
         function("bundle_widths")(self.reference, address(widths))
         self._camera_sums, self._pair_sums, self._row = widths.tolist()
-        self._passes, self._pairs = self._layout.shares(workers)
+        self._passes, self._pairs = self.layout.shares(workers)
         # The calling thread has the first share.
         others = max(len(self._passes), len(self._pairs)) - 1
         self._pool = ThreadPoolExecutor(others) if others else None
+
+    @property
+    def alone(self) -> bool:
+        """Tell whether one thread does all."""
+        return self._pool is None
 
     @property
     def factored(self) -> bool:
@@ -114,7 +119,7 @@ class NativeLinearizer:
     @property
     def skyline(self) -> Skyline:
         """Return the skyline of the reduced system, in blocks of cameras."""
-        return self._layout.skyline
+        return self.layout.skyline
 
     @property
     def width(self) -> int:
@@ -131,7 +136,7 @@ class NativeLinearizer:
     def with_loss(self, loss: Loss) -> NativeLinearizer:
         """Return the same observations with another loss."""
         other = copy.copy(self)
-        other.loss, other._bundle = loss, self._layout.bundle(loss)
+        other.loss, other._bundle = loss, self.layout.bundle(loss)
         other.reference = ctypes.byref(other._bundle)
         return other
 
@@ -159,7 +164,7 @@ class NativeLinearizer:
 
     def intersect(self, cameras: Array) -> Array:
         """Return homogeneous points of least algebraic error, unit vectors (m, 4)."""
-        points, inner = np.empty((self.graph.n_points, 4)), self._layout.inward(cameras)
+        points, inner = np.empty((self.graph.n_points, 4)), self.layout.inward(cameras)
         self._each("bundle_intersect", address(inner), address(points))
         return points
 
@@ -178,7 +183,7 @@ class NativeLinearizer:
         function("bundle_camera_blocks")(self.reference, *arrays)
         blocks = None
         if depths is not None and of_cameras is not None:
-            blocks = self._layout.outward(of_cameras), depths
+            blocks = self.layout.outward(of_cameras), depths
         coupling = NativeCoupling(self, *estimate)
         return Normal(self.wide(U), V, self.wide(g_cameras), g, coupling, blocks)
 
@@ -187,12 +192,16 @@ class NativeLinearizer:
     ) -> tuple[Array, Array]:
         """Return the points moved to where their own observations want them, and their costs."""
         costs = np.empty(len(points))
-        inner, moved = self._layout.inward(cameras), np.array(points, order="C")
-        damping = TRACE if self.model.metric else BLOCK
-        options = Refinement(how.iterations, damping, how.lam, how.factor, how.tolerance)
+        inner, moved = self.layout.inward(cameras), np.array(points, order="C")
+        options = self.refinement(how)
         arrays = map(address, (inner, moved, costs, None))
         self._each("bundle_refine_points", *arrays, ctypes.addressof(options))
         return moved, costs
+
+    def refinement(self, how: PointRefinement) -> Refinement:
+        """Return the C structure of a refinement."""
+        damping = TRACE if self.model.metric else BLOCK
+        return Refinement(how.iterations, damping, how.lam, how.factor, how.tolerance)
 
     def inverse_roots(self, V: Array, D: Array, lam: float, g: Array) -> tuple[Array, Array]:
         """Return T with T T^T = (V + lam D)^-1 for blocks (m, b, b), and T^T g."""
@@ -220,7 +229,7 @@ class NativeLinearizer:
 
     def wide(self, cameras: Array) -> Array:
         """Return vectors or blocks of the skyline's order and width in their own, zeros added."""
-        own = self._layout.outward(cameras)
+        own = self.layout.outward(cameras)
         if self._used is None:
             return own
         d, k = self.model.tangent_size, cameras.ndim - 1
@@ -232,11 +241,11 @@ class NativeLinearizer:
         """Return (n, d, ...) in the order of the skyline, without the entries that are known."""
         if cameras is not None and self._used is not None:
             cameras = cameras[:, self._used]
-        inner: Array | None = self._layout.inward(cameras)
+        inner: Array | None = self.layout.inward(cameras)
         return inner
 
     def _estimate(self, cameras: Array, points: Array) -> tuple[Array, Array]:
-        return self._layout.inward(cameras), np.ascontiguousarray(points)
+        return self.layout.inward(cameras), np.ascontiguousarray(points)
 
     # ---------------------------------------------------------------- passes
 
@@ -385,7 +394,7 @@ class NativePairs:
         own, d = self.linearizer, self.linearizer.width
         if A is None and d < own.model.tangent_size:
             A = np.broadcast_to(np.eye(own.model.tangent_size), U.shape)
-        inner_U, inner_A = own._layout.inward(U), own.narrow(A)
+        inner_U, inner_A = own.layout.inward(U), own.narrow(A)
         if own.factored:
             blocks, sizes = self.blocks, (d * d, d)
         else:
@@ -410,7 +419,7 @@ class NativePairs:
     def dense(self) -> Array:
         """Return P, (n, d, n, d)."""
         own, n = self.linearizer, self.skyline.n
-        d, order = own.model.tangent_size, own._layout.order
+        d, order = own.model.tangent_size, own.layout.order
         rows, columns = self.skyline.places
         if order is not None:
             rows, columns = order[rows], order[columns]
@@ -433,7 +442,7 @@ class NativeFactor:
 
     def solve(self, right: Array) -> Array:
         """Return the solution for right-hand sides (n, a, k)."""
-        layout, (n, a, k) = self.linearizer._layout, right.shape
+        layout, (n, a, k) = self.linearizer.layout, right.shape
         rows = layout.inward(right).reshape(n * a, k).T
         return layout.outward(self.inner.solve(rows).T.reshape(n, a, k))
 

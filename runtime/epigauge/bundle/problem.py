@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge import lm
+from epigauge.bundle import compiled
 from epigauge.bundle.freedom import Freedom
 from epigauge.bundle.linearizer import Linearizer, PointRefinement
 from epigauge.bundle.priors import Priors
@@ -86,6 +89,25 @@ class BundleProblem:
     priors: Priors | None = None
     refinement: PointRefinement | None = None
     floor: float = 0.0
+
+    def compiled(
+        self,
+        start: Estimate,
+        damping: Any,
+        schedule: Any,
+        stopping: lm.Stopping,
+        scale: float,
+        lam_floor: float,
+    ) -> lm.Outcome[BundleState] | None:
+        """Return what `lm.minimize` would, by the compiled loop; None where it cannot."""
+        if type(self) is not BundleProblem:
+            return None
+        done = compiled.minimized(self, start, damping, schedule, stopping, scale, lam_floor)
+        if done is None:
+            return None
+        cameras, points, cost, steps, counts, rows = done
+        state = BundleState(Estimate(cameras, points, start.steps + steps), cost)
+        return lm.Outcome(state, None, *counts, rows)
 
     def evaluate(self, estimate: Estimate) -> BundleState:
         """Return the state of an estimate; a cost of infinity where it has none."""

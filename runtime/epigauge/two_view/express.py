@@ -98,7 +98,7 @@ def completed(
     w = np.ones(len(x1)) if weights is None else weights
     matches = Matches(table, frame, *frame.forward(x1, x2), w)
     _, nfev, njev, nit, status = pair.numbers[k].tolist()
-    rows = native.history_rows(pair.history[:nfev], frame.scale**2)
+    rows = lm.rows(pair.history[:nfev], frame.scale**2)
     motion, F = pair.motion(k), pair.table[k, 55:64].reshape(3, 3)
     state = native.Minimum(motion, F, float(pair.table[k, 28]))
     outcome = lm.Outcome(state, None, nfev, njev, nit, status, rows)

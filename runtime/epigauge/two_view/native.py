@@ -164,17 +164,9 @@ def minimize(
         np.array(outcome.F).reshape(3, 3),
         outcome.cost,
     )
-    rows = history_rows(history[: outcome.nfev], scale)
+    rows = lm.rows(history[: outcome.nfev], scale)
     counts = (outcome.nfev, outcome.njev, outcome.nit, outcome.status)
     return lm.Outcome(state, None, *counts, rows)
-
-
-def history_rows(history: Array, scale: float) -> tuple[lm.Row, ...]:
-    """Return the history as rows, costs multiplied by `scale`."""
-    return tuple(
-        lm.Row(int(iteration), cost * scale, lam, norm, accepted == 1.0, seconds)
-        for iteration, cost, lam, norm, accepted, seconds in history.tolist()
-    )
 
 
 def _options(

@@ -1,0 +1,105 @@
+#define _POSIX_C_SOURCE 199309L
+
+#include "lm.h"
+
+#include <math.h>
+#include <string.h>
+#include <time.h>
+
+/* As in lm.py. */
+#define LAM_CEILING 1e16
+#define LAM_FACTOR 10.0
+#define TINIEST 1e-300
+
+static double now(void)
+{
+#ifdef CLOCK_MONOTONIC
+    struct timespec moment;
+    clock_gettime(CLOCK_MONOTONIC, &moment);
+    return (double)moment.tv_sec + 1e-9 * (double)moment.tv_nsec;
+#else
+    return (double)clock() / CLOCKS_PER_SEC;
+#endif
+}
+
+static double finite_or_infinity(double cost)
+{
+    return isfinite(cost) ? cost : INFINITY;
+}
+
+static void record(double *history, eg_lm_outcome *outcome, double cost, double lam, double norm,
+                   int accepted, double begun)
+{
+    if (history) {
+        double *row = history + (ptrdiff_t)EG_ROW * outcome->nfev;
+        row[0] = outcome->nit;
+        row[1] = cost;
+        row[2] = lam;
+        row[3] = norm;
+        row[4] = accepted;
+        row[5] = now() - begun;
+    }
+    outcome->nfev += 1;
+    outcome->current = accepted;
+}
+
+static int loop(const eg_lm_problem *problem, const eg_lm_options *options, double *history,
+                eg_lm_outcome *outcome)
+{
+    void *self = problem->self;
+    const double begun = history ? now() : 0.0;
+    outcome->cost = finite_or_infinity(problem->cost_at_start(self));
+    record(history, outcome, outcome->cost, 0.0, 0.0, 1, begun);
+    eg_lm_system system = problem->linearize(self);
+    outcome->njev = 1;
+    if (!isfinite(outcome->cost))
+        return -3;
+    double lam = options->start * (options->relative ? fmax(system.size, TINIEST) : 1.0);
+    const double least = options->floor * lam;
+    for (;;) {
+        double trial = 0.0, decrease = 0.0, norm = 0.0;
+        if (outcome->cost <= problem->floor)
+            return 5;
+        if (system.steepest <= options->gtol)
+            return 1;
+        if (system.decrement <= options->ftol * outcome->cost)
+            return 4;
+        const double ceiling = fmin(LAM_CEILING * fmax(system.size, TINIEST), 1e300);
+        for (;;) {
+            if (outcome->nit >= options->max_iter)
+                return 0;
+            const int made = problem->step(self, lam, &norm);
+            if (made == EG_STEP_HOPELESS)
+                return -1;
+            if (made == EG_STEP_MADE) {
+                outcome->nit += 1;
+                trial = finite_or_infinity(problem->cost_at_trial(self));
+                decrease = outcome->cost - trial;
+                record(history, outcome, trial, lam, norm, decrease > 0.0, begun);
+                if (decrease > 0.0)
+                    break;
+                if (fabs(decrease) <= 1e-15 * outcome->cost)
+                    return 2;
+            }
+            lam *= LAM_FACTOR;
+            if (!(lam <= ceiling))
+                return -1;
+        }
+        lam = fmax(lam / LAM_FACTOR, least);
+        outcome->cost = trial;
+        problem->accept(self);
+        system = problem->linearize(self);
+        outcome->njev += 1;
+        if (decrease <= options->ftol * outcome->cost)
+            return 2;
+        if (norm <= options->xtol)
+            return 3;
+    }
+}
+
+void eg_lm(const eg_lm_problem *problem, const eg_lm_options *options, double *history,
+           eg_lm_outcome *outcome)
+{
+    memset(outcome, 0, sizeof *outcome);
+    outcome->status = loop(problem, options, history, outcome);
+}
