@@ -171,11 +171,11 @@ def flatness(study: MetricGaugeStudy) -> Section:
                 counts.setdefault((method, d), []).append(steps_to(result, optimum))
     rows = []
     for method, label in LABELS.items():
-        cells: list[str | float] = [label]
+        cells: list[str | float | None] = [label]
         for d in FLATNESS:
             found = np.array(counts[method, d])
             there = np.isfinite(found)
-            cells += [float(np.mean(found[there])) if there.any() else float("nan")]
+            cells += [float(np.mean(found[there])) if there.any() else None]
             cells += [f"{there.sum()}/{len(found)}"]
         rows.append(tuple(cells))
     # Who did not come down has taken all steps.
@@ -221,7 +221,8 @@ def similarities(study: MetricGaugeStudy) -> Section:
     size = float(np.median(np.linalg.norm(start.X - np.median(start.X, axis=0), axis=1)))
     rows, alike, worst = [], {}, {}
     for method, label in study.track(list(LABELS.items()), "random similarities"):
-        cells: list[str | float] = [label, steps_to(here[method], optimum)]
+        own = steps_to(here[method], optimum)
+        cells: list[str | float | None] = [label, own if np.isfinite(own) else None]
         alike[method], worst[method] = True, 0.0
         for origin in ORIGINS:
             random = np.random.default_rng(study.seed)
