@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
         Matches,
         load_matches,
         load_reconstruction,
+        load_result,
         load_scene,
         load_tracks,
         save_matches,
@@ -90,6 +91,7 @@ __all__ = [
     "load_image",
     "load_matches",
     "load_reconstruction",
+    "load_result",
     "load_scene",
     "load_tracks",
     "match_images",
@@ -116,7 +118,7 @@ _WHERE = {
     "errors": "ArgumentError BackendError EpigaugeError FileFormatError",
     "images": "ImageMatches load_image match_images",
     "io": (
-        "Matches load_matches load_reconstruction load_scene load_tracks "
+        "Matches load_matches load_reconstruction load_result load_scene load_tracks "
         "save_matches save_reconstruction save_result save_scene save_tracks"
     ),
     "kernels": "backend set_backend",

@@ -1,6 +1,6 @@
 """Commands for files of matches and tracks: human text on stderr, data on stdout.
 
-Exit codes: 0 done, 1 did not converge, 2 bad input. One module a command; a command is a function
+Exit codes: 0 done, 1 not to be used, 2 bad input. One module a command; a command is a function
 that returns its exit code, registered here.
 """
 
@@ -17,6 +17,7 @@ from epigauge.cli.colmap import colmap
 from epigauge.cli.compare import compare
 from epigauge.cli.data import data
 from epigauge.cli.demo import demo
+from epigauge.cli.estimate import estimate
 from epigauge.cli.info import info
 from epigauge.cli.pair import pair
 from epigauge.cli.refine import refine
@@ -47,9 +48,10 @@ def _main(
     """Geometry of uncalibrated images: the maximum-likelihood fundamental matrix.
 
     Text for people goes to stderr, data to stdout.
-    Exit codes: 0 done, 1 did not converge, 2 bad input.
+    Exit codes: 0 done, 1 the result must not be used (it did not converge, or its
+    flags say so), 2 bad input.
     """
 
 
-for _function in (demo, refine, pair, bundle, compare, colmap, data, info, reproduce):
+for _function in (demo, refine, estimate, pair, bundle, compare, colmap, data, info, reproduce):
     app.command()(command(_function))

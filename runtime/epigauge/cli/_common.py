@@ -12,8 +12,11 @@ from typing import Annotated, Any, ParamSpec
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
+import epigauge as eg
+from epigauge import verdicts
 from epigauge.errors import EpigaugeError
 from epigauge.io._common import check_suffix
 from epigauge.io.output import json_text, plain
@@ -83,6 +86,17 @@ def facts(title: str, rows: dict[str, str]) -> Table:
     for name, value in rows.items():
         table.add_row(name, value)
     return table
+
+
+def warn(out: Console, result: eg.FundamentalResult) -> None:
+    """Tell people what the matches of a pair do not support, and what to do."""
+    for flag, sentence in verdicts.explained(result.flags).items():
+        out.print(f"[bold red]{escape(flag)}:[/] {escape(sentence)}", soft_wrap=True)
+    if result.rank < 7 and result.E is None:
+        text = f"the matches determine only {result.rank} of the 7 directions of F"
+        out.print(f"[bold red]rank:[/] {text}", soft_wrap=True)
+    if result.status <= 0:
+        out.print(f"[bold red]did not converge:[/] {escape(result.message)}", soft_wrap=True)
 
 
 def shown(path: Path) -> str:

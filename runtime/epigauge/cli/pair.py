@@ -21,12 +21,13 @@ from epigauge.cli._common import (
     facts,
     named,
     shown,
+    warn,
     write_json,
 )
 from epigauge.cli.refine import epipoles, standard_deviations
 from epigauge.errors import ArgumentError
 from epigauge.images import ImageMatches, match_images
-from epigauge.images.summary import explained, summary
+from epigauge.images.summary import summary
 from epigauge.io import plain, save_result
 from epigauge.two_view.robust import RobustResult
 
@@ -136,7 +137,6 @@ def pair(
         "std_F": std_F,
         "std_sigma": std_sigma,
         "epipoles": epipoles(result.F),
-        "flags": list(result.flags),
         "noise_estimated": noise_px is None,
         "seconds": seconds,
     }
@@ -152,8 +152,7 @@ def pair(
         rows = summary(result, matches, seconds) | {"status": result.message}
         title = escape(f"{named(image1)} - {named(image2)}")
         out.print(facts(title, {name: escape(value) for name, value in rows.items()}))
-        for flag, sentence in explained(result).items():
-            out.print(f"[bold red]{escape(flag)}:[/] {escape(sentence)}", soft_wrap=True)
+        warn(out, result)
         for row in result.F:
             typer.echo(" ".join(f"{value: 24.17g}" for value in row))
     return DONE if result.success else NOT_CONVERGED
@@ -169,7 +168,7 @@ def _check(matches: ImageMatches, names: str) -> None:
             names,
             f"have {counts} but only {len(matches)} matches",
             f"at least {_AT_LEAST}: photographs that overlap and are not blank or blurred, or "
-            "another --detector, a --ratio nearer to 1",
+            "another --detector",
         )
 
 

@@ -21,6 +21,7 @@ from epigauge.cli._common import (
     console,
     facts,
     shown,
+    warn,
     write_json,
 )
 from epigauge.errors import ArgumentError, FileFormatError
@@ -28,8 +29,8 @@ from epigauge.io import Matches, load_matches, plain, save_result
 
 Array = NDArray[np.float64]
 
-#: Arguments of `refine_fundamental` that come from the file.
-_FROM_FILE = ("x1", "x2", "x1, x2", "weights")
+#: Arguments of the solvers that come from the file.
+FROM_FILE = ("x1", "x2", "x1, x2", "weights")
 
 
 def refine(
@@ -71,6 +72,8 @@ def refine(
     if output is not None:
         check_target(output, ".npz", ".json")
     pair = load_matches(matches, inliers=inliers)
+    if not inliers:
+        warn_of_marks(pair, "which is ignored: --inliers uses only them")
     begin = time.perf_counter()
     try:
         result = eg.refine_fundamental(
@@ -86,34 +89,65 @@ def refine(
             backend=backend,
         )
     except ArgumentError as error:
-        if error.argument in _FROM_FILE:
+        if error.argument in FROM_FILE:
             raise FileFormatError(matches, str(error)) from None
         raise
     seconds = time.perf_counter() - begin
+    rows = {"matches": str(len(pair))}
+    more = {"source": str(matches), "matches": len(pair), "noise_estimated": noise_px is None}
+    used = np.arange(len(pair))
+    return finish(result, pair, used, more | {"seconds": seconds}, rows, output, plot, json)
 
+
+def finish(
+    result: eg.FundamentalResult,
+    pair: Matches,
+    used: NDArray[np.intp],
+    more: dict[str, Any],
+    rows: dict[str, str],
+    output: Path | None,
+    plot: Path | None,
+    json: bool,
+) -> int:
+    """Save, draw and tell what came out of the matches of a file; return the exit code.
+
+    Parameters
+    ----------
+    result : FundamentalResult
+        What came out.
+    pair : Matches
+        The file's matches.
+    used : ndarray of int
+        Those that the result is for.
+    more : dict
+        What else to save and to write as JSON.
+    rows : dict of str to str
+        First lines of the table for people.
+    output, plot, json
+        The options of the command.
+    """
     std_F, std_sigma = standard_deviations(result.F, result.covariance)
-    more = {
-        "source": str(matches),
-        "matches": len(pair),
-        "std_F": std_F,
-        "std_sigma": std_sigma,
-        "epipoles": epipoles(result.F),
-        "noise_estimated": noise_px is None,
-        "seconds": seconds,
-    }
+    more = more | {"std_F": std_F, "std_sigma": std_sigma, "epipoles": epipoles(result.F)}
     if output is not None:
         save_result(output, result, **more)
     if plot is not None:
-        _draw(plot, result, pair)
+        _draw(plot, result, pair, used)
     if json:
         everything = plain(result)
         del everything["jac"]
         write_json(everything | more)
     else:
-        _report(result, more)
+        _report(result, more, rows)
         for row in result.F:
             typer.echo(" ".join(f"{value: 24.17g}" for value in row))
     return DONE if result.success else NOT_CONVERGED
+
+
+def warn_of_marks(pair: Matches, then: str) -> None:
+    """Tell people that a file marks inliers, and what happens to the marks."""
+    if pair.marked is not None and pair.marked < len(pair):
+        text = f"the file marks {pair.marked} of {len(pair)} matches as inliers, {then}"
+        console().print(text, soft_wrap=True)
 
 
 def standard_deviations(F: Array, covariance: Array) -> tuple[Array, float]:
@@ -149,20 +183,20 @@ def epipoles(F: Array) -> list[list[float]]:
         return [(e[:2] / e[2]).tolist() for e in (Vt[2], U[:, 2])]
 
 
-def _draw(path: Path, result: eg.FundamentalResult, pair: Matches) -> None:
+def _draw(path: Path, result: eg.FundamentalResult, pair: Matches, used: NDArray[np.intp]) -> None:
     """Write the picture."""
     from epigauge.plots import plot_refinement, save_figure
 
     sizes = (pair.image_size1, pair.image_size2)
-    save_figure(plot_refinement(result, pair.x1, pair.x2, image_sizes=sizes), path)
+    figure = plot_refinement(result, pair.x1[used], pair.x2[used], image_sizes=sizes)
+    save_figure(figure, path)
 
 
-def _report(result: eg.FundamentalResult, more: dict[str, Any]) -> None:
+def _report(result: eg.FundamentalResult, more: dict[str, Any], rows: dict[str, str]) -> None:
     """Tell people on stderr what came out."""
     origin = "estimated from the residuals" if more["noise_estimated"] else "given"
     e1, e2 = (_place(e) for e in more["epipoles"])
-    rows = {
-        "matches": str(more["matches"]),
+    rows = rows | {
         "rms_px": f"{result.rms_px:.6g} per coordinate",
         "noise_px": f"{result.noise_px:.6g}, {origin}",
         "sigma": f"{result.sigma:.8g}, standard deviation {more['std_sigma']:.2g}",
@@ -171,16 +205,13 @@ def _report(result: eg.FundamentalResult, more: dict[str, Any]) -> None:
         "status": escape(result.message),
         "seconds": f"{more['seconds']:.4f}",
     }
-    if result.rank < 7:
-        rows["warning"] = f"the matches determine only {result.rank} of the 7 directions of F"
     out = console()
     out.print(facts(escape(shown(Path(more["source"]))), rows))
     deviations = Table(title="standard deviation of F", show_header=False, title_justify="left")
     for row in more["std_F"]:
         deviations.add_row(*(f"{value:.2e}" for value in row))
     out.print(deviations)
-    if not result.success:
-        out.print(f"[bold red]did not converge:[/] {escape(result.message)}")
+    warn(out, result)
 
 
 def _place(e: list[float]) -> str:

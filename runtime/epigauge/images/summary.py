@@ -53,7 +53,7 @@ def explained(result: RobustResult) -> dict[str, str]:
     found = verdicts.explained(result.flags)
     if result.rank < 7:
         found["rank"] = f"The matches determine only {result.rank} of the 7 directions of F."
-    if not result.success:
+    if result.status <= 0:
         found["not converged"] = _sentence(result.message)
     return found
 

@@ -14,6 +14,7 @@ from epigauge.io._scene import ColmapSource, SceneSource
 from epigauge.io.matches import Matches, load_matches, save_matches
 from epigauge.io.output import plain, save_result, writing
 from epigauge.io.ply import save_ply
+from epigauge.io.results import load_result
 from epigauge.io.scene_files import load_scene, save_scene
 from epigauge.io.tracks import (
     TrackFile,
@@ -32,6 +33,7 @@ __all__ = [
     "TrackFile",
     "load_matches",
     "load_reconstruction",
+    "load_result",
     "load_scene",
     "load_track_file",
     "load_tracks",

@@ -20,6 +20,8 @@ _MAX_VALUES = 4 * MAX_MATCHES
 _MAX_HEADER = 1000
 _DESCR = re.compile(r"'descr': *'([^']*)'")
 _NUMBERS = re.compile(r"[<>|=]?[biuf]\d{1,2}")
+#: Numbers or text.
+_PLAIN = re.compile(r"[<>|=]?(?:[biuf]\d{1,2}|U\d{1,5})")
 _ORDER = re.compile(r"'fortran_order': *(True|False)")
 _SHAPE = re.compile(r"'shape': *\(([0-9, ]{0,100})\)")
 
@@ -66,11 +68,24 @@ def read_npz(
         return {name: _read_npy(path, archive, members[name]) for name in wanted}
 
 
-def _read_npy(path: Path, archive: zipfile.ZipFile, member: str) -> NDArray[Any]:
+def read_every_array(path: Path, file: IO[bytes]) -> dict[str, NDArray[Any]]:
+    """Read all arrays of an NPZ file, numbers and text, as `read_npz` does."""
+    if not file.read(1):
+        raise FileFormatError(path, "is empty")
+    with damage(path, "is not a readable NPZ (ZIP) file"), zipfile.ZipFile(file) as archive:
+        return {
+            name.removesuffix(".npy"): _read_npy(path, archive, name, _PLAIN)
+            for name in archive.namelist()
+        }
+
+
+def _read_npy(
+    path: Path, archive: zipfile.ZipFile, member: str, types: re.Pattern[str] = _NUMBERS
+) -> NDArray[Any]:
     """Read one array, having checked its declared type and size before allocating it."""
     name = member.removesuffix(".npy")
     with damage(path, f"array {name} is damaged"), archive.open(member) as stream:
-        shape, by_columns, dtype = _read_header(path, name, stream)
+        shape, by_columns, dtype = _read_header(path, name, stream, types)
         if not all(0 <= side <= MAX_MATCHES for side in shape) or math.prod(shape) > _MAX_VALUES:
             raise FileFormatError(
                 path, f"array {name} has shape {cut(shape)}, needed: at most {MAX_MATCHES} rows"
@@ -89,7 +104,9 @@ def _read_npy(path: Path, archive: zipfile.ZipFile, member: str) -> NDArray[Any]
         return values.reshape(shape, order="F" if by_columns else "C")
 
 
-def _read_header(path: Path, name: str, stream: IO[bytes]) -> tuple[tuple[int, ...], bool, Any]:
+def _read_header(
+    path: Path, name: str, stream: IO[bytes], types: re.Pattern[str]
+) -> tuple[tuple[int, ...], bool, Any]:
     """Read shape, order and type of an npy array.
 
     NumPy's own reader evaluates the header as Python source and, for files of Python 2, tokenises
@@ -104,7 +121,7 @@ def _read_header(path: Path, name: str, stream: IO[bytes]) -> tuple[tuple[int, .
     if len(header) != length or order is None or shape is None:
         raise FileFormatError(path, f"array {name} is damaged: npy header {cut(header)!r}")
     descr = _DESCR.search(header)
-    if descr is None or not _NUMBERS.fullmatch(descr[1]):
+    if descr is None or not types.fullmatch(descr[1]):
         kind = "structured values" if descr is None else f"values of type {cut(descr[1])}"
         raise FileFormatError(path, f"array {name} holds {kind}, needed: plain numbers")
     return (

@@ -35,6 +35,8 @@ class Matches:
         (width, height) of the images, in pixels.
     name : str
         What to call the pair: the file's name without its suffix.
+    marked : int, optional
+        How many of the matches the file marks as inliers; None where it marks none.
     """
 
     x1: Array
@@ -43,6 +45,7 @@ class Matches:
     image_size1: tuple[int, int] | None = None
     image_size2: tuple[int, int] | None = None
     name: str = ""
+    marked: int | None = None
 
     def __len__(self) -> int:
         return len(self.x1)
@@ -132,7 +135,7 @@ def save_matches(path: PathLike, matches: Matches) -> None:
 
 def _from_npz(path: Path, file: IO[bytes], inliers: bool) -> dict[str, Any]:
     """Read the arrays of an NPZ file."""
-    optional = ["weights", "image_size1", "image_size2", *(["inlier"] if inliers else [])]
+    optional = ["weights", "image_size1", "image_size2", "inlier"]
     found: dict[str, Any] = read_npz(path, file, [("x1", "x2"), ("matches",)], optional)
     if "matches" in found:
         table = found.pop("matches")
@@ -170,6 +173,7 @@ def _matches(path: Path, fields: dict[str, Any], inliers: bool) -> Matches:
         _image_size(path, "image_size1", fields),
         _image_size(path, "image_size2", fields),
         path.stem,
+        int(np.count_nonzero(fields["inlier"][keep])) if "inlier" in fields else None,
     )
 
 

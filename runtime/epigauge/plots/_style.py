@@ -37,10 +37,12 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), dpi=110, layout=layout)
 
 
-def heading(figure: Figure, text: str, failure: str = "") -> None:
-    """Write over the picture what was done and, in red, why that did not converge."""
+def heading(figure: Figure, text: str, failure: str = "", flags: Sequence[str] = ()) -> None:
+    """Write over the picture what was done and, in red, its flags and why it did not converge."""
     text += f"  (not converged: {failure})" if failure else ""
-    figure.suptitle(text, x=0.01, ha="left", fontsize=13, color=RED if failure else "black")
+    text += f"\n{', '.join(flags)}" if flags else ""
+    colour = RED if failure or flags else "black"
+    figure.suptitle(text, x=0.01, ha="left", fontsize=13, color=colour)
 
 
 def save_figure(figure: Figure, path: PathLike) -> None:

@@ -111,7 +111,8 @@ def plot_pair(
     if below is not None:
         text = f"{matches.name}: {np.count_nonzero(result.inlier)} of {len(matches)} matches agree"
         text += f", RMS {result.rms_px:.3g} px per coordinate"
-        heading(figure, text, "" if result.success else result.message)
+        failure = "" if result.status > 0 else result.message
+        heading(figure, text, failure, result.flags)
         left, right = below.subplots(1, 2, width_ratios=(1.25, 1.0))
         _write(left, rows)
         _draw_distances(right, d)

@@ -76,7 +76,8 @@ def plot_refinement(
     top = min(max(0.5 * _WIDTH * aspect, 2.0), 6.0)
     figure = new_figure(_WIDTH, top + 4.0)
     text = f"Fundamental matrix from {len(d)} matches: RMS {result.rms_px:.4g} px per coordinate"
-    heading(figure, text, "" if result.success else result.message)
+    failure = "" if result.status > 0 else result.message
+    heading(figure, text, failure, result.flags)
     grid = figure.add_gridspec(2, 2, height_ratios=(top, 3.0))
 
     chosen = _spread_over_pencil(F, feet[0], feet[1], boxes[1])
