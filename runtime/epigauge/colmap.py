@@ -25,8 +25,10 @@ from epigauge.two_view.batch import (
     FundamentalBatch,
     refine_fundamental_batch,
 )
+from epigauge.two_view.copies import earliest
 from epigauge.two_view.geometry import reprojection_distances
 from epigauge.two_view.initial import fundamental_8point
+from epigauge.verdicts import ordered
 
 if TYPE_CHECKING:
     from epigauge.io.colmap import VerifiedPairs
@@ -39,14 +41,28 @@ Indices = NDArray[np.int64]
 #: What became of a pair.
 VERDICTS = {
     "refined": "at the minimum of the reprojection error, no worse than before",
-    "degenerate": "the inliers do not determine F",
+    "degenerate": "the inliers do not determine F, or COLMAP says so (config 4 to 6)",
+    "unsupported": "wrong matches among the inliers, or nothing but wrong ones",
+    "distorted": "the lens bends the points by more than their noise: undistort them first",
     "worse": "the RMS of the inliers rose, as it may with a robust loss",
     "not converged": "the refinement stopped early",
     "skipped": "the pair could not be read, or has too few inliers",
 }
 
-#: Flags of `FundamentalResult.flags` that make a pair degenerate.
-_DEGENERATE = {"planar scene", "pure rotation", "weak geometry"}
+#: Flags of `FundamentalResult.flags` that make a pair unsupported, and degenerate.
+_UNSUPPORTED = {"no common geometry", "gross errors"}
+_DEGENERATE = {"still camera", "planar scene", "nearly planar", "pure rotation", "weak geometry"}
+
+#: What COLMAP says of pairs that one homography describes, by config.
+_HOMOGRAPHY = {
+    4: "COLMAP calls it planar",
+    5: "COLMAP calls it a panorama",
+    6: "COLMAP calls it planar or a panorama",
+}
+
+#: A lens bends the points when it moves them by more than this many deviations of their noise, and
+#: by more than so many pixels.
+_BENT, _BENT_PX = 1.0, 0.5
 
 #: A relative rise of the RMS up to this is rounding.
 _ROUNDING = 1e-9
@@ -175,8 +191,10 @@ def refine_database(
     Notes
     -----
     Keypoints are used where they were found: lens distortion is not removed, as in COLMAP's own
-    estimates of F. COLMAP takes the motion of calibrated pairs from E; F counts for uncalibrated
-    pairs and for focal lengths found from F.
+    estimates of F. Where it moves the points by more than their noise, the verdict is "distorted":
+    `colmap image_undistorter` and matching anew give pairs that F can describe. COLMAP takes the
+    motion of calibrated pairs from E; F counts for uncalibrated pairs and for focal lengths found
+    from F.
     """
     # Here, since a Python may come without SQLite
     from epigauge.io.colmap import ColmapDatabase
@@ -243,7 +261,8 @@ def _refined(
 def _start(pairs: VerifiedPairs, k: int) -> tuple[float, Array]:
     """Return the RMS of the stored F of a pair, and the F to start from."""
     rows = slice(pairs.offsets[k], pairs.offsets[k + 1])
-    x1, x2 = pairs.x1[rows], pairs.x2[rows]
+    once = earliest(pairs.x1[rows], pairs.x2[rows]) == np.arange(rows.stop - rows.start)
+    x1, x2 = pairs.x1[rows][once], pairs.x2[rows][once]
     before = _rms_px(pairs.F[k], x1, x2)
     try:
         linear = fundamental_8point(x1, x2)
@@ -268,12 +287,22 @@ def _verdict(
     reason = pairs.reasons.get(k) or batch.reasons.get(k)
     if reason is not None:
         return "skipped", reason
-    flags = ", ".join(batch.flags[k])
+    raised = set(batch.flags[k])
+    if pairs.bend_px[k] > max(_BENT * batch.noise_px[k], _BENT_PX):
+        raised.add("distorted cameras")
+    flags = ", ".join(ordered(raised))
+    if not _UNSUPPORTED.isdisjoint(raised):
+        return "unsupported", flags
+    config = _HOMOGRAPHY.get(int(pairs.config[k]))
+    if config is not None:
+        return "degenerate", f"{config}; {flags}" if flags else config
     if not np.isfinite(np.diag(batch.covariance[k])).all():
         return "degenerate", f"the inliers determine {batch.rank[k]} directions of F: {flags}"
-    if not _DEGENERATE.isdisjoint(batch.flags[k]):
+    if not _DEGENERATE.isdisjoint(raised):
         return "degenerate", flags
-    if not batch.success[k]:
+    if "distorted cameras" in raised:
+        return "distorted", flags
+    if batch.status[k] <= 0:
         return "not converged", BATCH_STATUS[int(batch.status[k])]
     if batch.rms_px[k] > before * (1.0 + _ROUNDING):
         return "worse", flags

@@ -129,11 +129,16 @@ def test_reading_leaves_nothing_behind(by_colmap) -> None:
 
 def test_a_stored_F_far_from_the_points_is_no_start(database) -> None:
     expected = eg.colmap.refine_database(database)
-    eye = np.eye(3).tobytes()  # what many scripts write
-    change(database, "UPDATE two_view_geometries SET F = ?", parameters=(eye,))
+    wrong = np.array([[0.0, 1e-3, -0.4], [1e-3, 0.0, -0.3], [-0.4, -0.3, 200.0]]).tobytes()
+    change(database, "UPDATE two_view_geometries SET F = ?", parameters=(wrong,))
     result = eg.colmap.refine_database(database)
     np.testing.assert_allclose(result.rms_px, expected.rms_px, rtol=1e-9)
     assert (result.rms_before_px > 10.0).all()
+    eye = np.eye(3).tobytes()  # COLMAP's placeholder, which is no F
+    change(database, "UPDATE two_view_geometries SET F = ?", parameters=(eye,))
+    result = eg.colmap.refine_database(database)
+    np.testing.assert_allclose(result.rms_px, expected.rms_px, rtol=1e-9)
+    assert np.isnan(result.rms_before_px).all()
 
 
 # verdicts

@@ -107,11 +107,14 @@ def _table(
 
 
 def fundamental(data: Any) -> Array:
-    """Return a stored F, of unit norm; NaN where there is none (subnormal numbers are none)."""
+    """Return a stored F, of unit norm; NaN where there is none.
+
+    Subnormal numbers are none, nor is the identity, COLMAP's placeholder.
+    """
     if isinstance(data, bytes) and len(data) == 72:
         F = np.frombuffer(data, "<f8").reshape(3, 3)
         largest = np.abs(F).max()
-        if np.finfo(float).tiny <= largest < np.inf:
+        if np.finfo(float).tiny <= largest < np.inf and not np.array_equal(F, np.eye(3)):
             F = F / largest
             return np.asarray(F / np.linalg.norm(F))
     return np.full((3, 3), np.nan)

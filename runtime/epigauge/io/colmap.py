@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.errors import FileFormatError
+from epigauge.io._colmap_lens import bend_px
 from epigauge.io._colmap_rows import CONFIGS, MAX_IMAGES, Points, fundamental, inliers, keypoints
 from epigauge.io._common import MAX_MATCHES, PathLike
 from epigauge.io._sqlite import connect, copy_beside, sqlite_errors, stamp
@@ -74,6 +75,8 @@ class VerifiedPairs:
         Pair k has the inliers ``offsets[k]:offsets[k + 1]``.
     reasons : dict of int to str
         Why a pair has none, by its place in these arrays.
+    bend_px : ndarray, shape (n,)
+        How far the lenses bend the inliers, RMS of the image where it is more.
     """
 
     pair_id: Indices
@@ -84,6 +87,7 @@ class VerifiedPairs:
     x2: Array
     offsets: Indices
     reasons: dict[int, str]
+    bend_px: Array
 
     def __len__(self) -> int:
         return len(self.pair_id)
@@ -171,6 +175,12 @@ class ColmapDatabase:
             "WHERE rows > 0 ORDER BY pair_id"
         )
         places = functools.lru_cache(_IMAGES_KEPT)(self._keypoints)
+        camera = functools.cache(self._camera)
+
+        def lens(image_id: int, points: Array) -> float:
+            with sqlite_errors(self.path):
+                return bend_px(camera(image_id), points)
+
         with sqlite_errors(self.path):
             cursor = self._connection.execute(query)
         while True:
@@ -182,6 +192,10 @@ class ColmapDatabase:
             sizes = [0 if isinstance(pair, str) else len(pair[0]) for pair in found]
             points = [pair for pair in found if not isinstance(pair, str)]
             ids = np.array([row[0] for row in rows], np.int64)
+            bends = [
+                0.0 if isinstance(pair, str) else max(map(lens, divmod(row[0], MAX_IMAGES), pair))
+                for row, pair in zip(rows, found, strict=True)
+            ]
             yield VerifiedPairs(
                 pair_id=ids,
                 config=np.array([row[4] if row[4] in CONFIGS else -1 for row in rows], np.int64),
@@ -191,6 +205,7 @@ class ColmapDatabase:
                 x2=np.concatenate([np.zeros((0, 2)), *(x2 for _, x2 in points)]),
                 offsets=np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
                 reasons={k: pair for k, pair in enumerate(found) if isinstance(pair, str)},
+                bend_px=np.array(bends),
             )
 
     def store(self, pairs: Iterable[tuple[int, Array]]) -> None:
@@ -237,6 +252,15 @@ class ColmapDatabase:
             closing(connect(self.path, False, _LONGEST)[0]) as source,
         ):
             return copy_beside(source, self.path)
+
+    def _camera(self, image_id: int) -> tuple[object, object] | None:
+        """Return model and parameters of an image's camera, None where nothing tells them."""
+        query = "SELECT model, params FROM cameras JOIN images USING (camera_id) WHERE image_id = ?"
+        try:
+            row = self._connection.execute(query, (image_id,)).fetchone()
+        except sqlite3.OperationalError:  # no such table or column: a database without cameras
+            return None
+        return None if row is None else (row[0], row[1])
 
     def _keypoints(self, image_id: int) -> Points | str:
         """Return the places of an image's keypoints, or what is wrong with them."""

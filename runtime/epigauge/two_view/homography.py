@@ -11,8 +11,8 @@ Array = NDArray[np.float64]
 
 #: Iterations of the robust fit, and fours of matches that it is tried from: with half of the
 #: matches on the plane one in sixteen is clean.
-_ROUNDS = 10
-_SAMPLES = 60
+_ROUNDS = 15
+_SAMPLES = 40
 
 #: A distance below this, in conditioned coordinates, is rounding.
 _ROUNDING = 1e-8
@@ -40,8 +40,7 @@ def fit_homography(q1: Array, q2: Array, weights: Array) -> tuple[Array, Array, 
     A = _equations(q1, q2)
     inverse = np.broadcast_to(np.eye(2), (len(A), 2, 2))
     for _ in range(4):  # converges as the noise over the size of the scene
-        N = np.einsum("n,nia,nij,njb->ab", weights, A, inverse, A, optimize=True)
-        H = np.linalg.eigh(N)[1][:, 0].reshape(3, 3)
+        H, N = _least(A, inverse, weights)
         inverse = _inverse(H, q1, q2)
     return H, _squares(H, q1, q2, A), N
 
@@ -73,10 +72,22 @@ def robust_homography(q1: Array, q2: Array, weights: Array) -> tuple[Array, Arra
 
 def _reweighted(q1: Array, q2: Array, weights: Array, own: Array) -> tuple[Array, Array]:
     """Fit with weights, and again with those that the distances give."""
+    A = _equations(q1, q2)
+    inverse = np.broadcast_to(np.eye(2), (len(A), 2, 2))
     for _ in range(_ROUNDS):
-        H, squares, _ = fit_homography(q1, q2, own)
+        H = _least(A, inverse, own)[0]
+        inverse = _inverse(H, q1, q2)
+        c = A @ H.ravel()
+        squares = np.einsum("ni,nij,nj->n", c, inverse, c)
         own = weights / (1.0 + squares / _median(squares)) ** 2
     return H, squares
+
+
+def _least(A: Array, inverse: Array, weights: Array) -> tuple[Array, Array]:
+    """Return the H that minimises the weighted squares of the equations, and their J^T J."""
+    scaled = (inverse @ A) * weights[:, None, None]
+    N = A.reshape(-1, 9).T @ scaled.reshape(-1, 9)
+    return np.linalg.eigh(N)[1][:, 0].reshape(3, 3), N
 
 
 def _near_a_sample(q1: Array, q2: Array, weights: Array) -> Array:

@@ -1,0 +1,230 @@
+"""Verdicts of two views: kinds of input that determine nothing, in every entry."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+import epigauge as eg
+import numpy as np
+import pytest
+from colmap_databases import SCHEMA, pair_id
+from two_views import Array
+
+K = np.array([[1000.0, 0.0, 640.0], [0.0, 1000.0, 480.0], [0.0, 0.0, 1.0]])
+SIZE = [1280.0, 960.0]
+
+needs_a_front_end = pytest.mark.skipif(
+    not any(__import__("importlib.util").util.find_spec(name) for name in ("poselib", "cv2")),
+    reason="needs a front end",
+)
+
+
+def pixels(X: Array) -> Array:
+    h = X @ K.T
+    return np.asarray(h[:, :2] / h[:, 2:])
+
+
+def plane(n: int, wrong: int, seed: int) -> tuple[Array, Array]:
+    """Matches of a slanted plane, and wrong ones that a verifier let through."""
+    rng = np.random.default_rng(seed)
+    X = np.column_stack([rng.uniform(-1.5, 1.5, n), rng.uniform(-1.0, 1.0, n), np.full(n, 4.0)])
+    X[:, 2] += 0.4 * X[:, 0]
+    x1, x2 = (pixels(Y) + rng.normal(0.0, 0.5, (n, 2)) for Y in (X, X + np.array([0.6, 0.1, 0.1])))
+    others = rng.uniform([0.0, 0.0], SIZE, (2, wrong, 2))
+    return np.vstack([x1, others[0]]), np.vstack([x2, others[1]])
+
+
+def write(path: Path, x1: Array, x2: Array, *, config: int = 3, camera: tuple[int, Array]) -> Path:
+    """Make a COLMAP database of one pair."""
+    m = len(x1)
+    with sqlite3.connect(path) as connection:
+        connection.executescript(SCHEMA)
+        row = (1, camera[0], 1280, 960, np.asarray(camera[1], "<f8").tobytes(), 0)
+        connection.execute("INSERT INTO cameras VALUES (?, ?, ?, ?, ?, ?)", row)
+        for image, x in ((1, x1), (2, x2)):
+            connection.execute("INSERT INTO images VALUES (?, ?, 1)", (image, f"{image}.jpg"))
+            table = (image, m, 2, x.astype("<f4").tobytes())
+            connection.execute("INSERT INTO keypoints VALUES (?, ?, ?, ?)", table)
+        inliers = np.column_stack([np.arange(m)] * 2).astype("<u4").tobytes()
+        connection.execute(
+            "INSERT INTO two_view_geometries VALUES (?, ?, 2, ?, ?, ?, NULL, NULL, NULL, NULL)",
+            (pair_id(1, 2), m, inliers, config, np.eye(3).tobytes()),
+        )
+    connection.close()
+    return path
+
+
+PINHOLE = (0, np.array([1000.0, 640.0, 480.0]))
+
+
+class TestPlanes:
+    @pytest.mark.parametrize("wrong", [0, 1, 2, 10, 30])
+    def test_wrong_matches_do_not_hide_a_plane_from_refine_and_batch(self, wrong) -> None:
+        x1, x2 = plane(100, wrong, seed=3)
+        single = eg.refine_fundamental(x1, x2)
+        batch = eg.refine_fundamental_batch(x1, x2, [0, len(x1)])
+        for flags in (single.flags, batch.flags[0]):
+            assert {"planar scene", "nearly planar"} & set(flags), flags
+        assert batch.success[0] == single.success
+        assert ("gross errors" in single.flags) == (wrong >= 10)
+
+    @needs_a_front_end
+    @pytest.mark.parametrize("wrong", [0, 2, 30])
+    def test_nor_from_estimate(self, wrong) -> None:
+        result = eg.estimate_fundamental(*plane(100, wrong, seed=4))
+        assert "planar scene" in result.flags
+        assert not result.success
+
+    @pytest.mark.parametrize(("wrong", "config"), [(0, 3), (2, 3), (2, 6), (0, 4)])
+    def test_nor_from_a_database_which_keeps_what_it_had(self, tmp_path, wrong, config) -> None:
+        file = write(tmp_path / "d.db", *plane(100, wrong, seed=5), config=config, camera=PINHOLE)
+        result = eg.colmap.refine_database(file, write=True, backup=False)
+        assert result.verdict == ("degenerate",)
+        assert "planar" in result.note[0]
+        assert not result.stored.any()
+        assert np.isnan(result.F_before).all()  # the identity is COLMAP's placeholder
+
+    def test_colmaps_word_counts_where_the_matches_look_well(self, tmp_path) -> None:
+        view = eg.two_view_scene(3.0, n_points=60, noise_px=0.3, seed=1)
+        for config, verdict in ((3, "refined"), (6, "degenerate")):
+            file = tmp_path / f"{config}.db"
+            write(file, view.x1 + 640.0, view.x2 + 640.0, config=config, camera=PINHOLE)
+            assert eg.colmap.refine_database(file).verdict == (verdict,)
+
+    @pytest.mark.slow
+    def test_hand_labelled_planes_are_told_and_whole_scenes_are_not(self, data_dir) -> None:
+        told = {"refine": 0, "estimate": 0}
+        planes = 0
+        for file in sorted((data_dir / "pairs").glob("adelaide_*.npz")):
+            with np.load(file) as pair:
+                x1, x2, label = pair["x1"], pair["x2"], pair["label"]
+            for k in range(1, label.max() + 1):
+                if np.count_nonzero(label == k) < 20:
+                    continue
+                planes += 1
+                for name, solve in (
+                    ("refine", eg.refine_fundamental),
+                    ("estimate", eg.estimate_fundamental),
+                ):
+                    flags = set(solve(x1[label == k], x2[label == k]).flags)
+                    told[name] += bool(flags & {"planar scene", "nearly planar"})
+        assert planes == 22
+        assert min(told.values()) >= 20, told
+
+
+class TestNothingInCommon:
+    @pytest.mark.parametrize("m", [20, 60, 300])
+    def test_random_matches_into_refine(self, m) -> None:
+        for seed in range(3):
+            x1, x2 = np.random.default_rng(seed).uniform([0, 0], SIZE, (2, m, 2))
+            result = eg.refine_fundamental(x1, x2)
+            assert "no common geometry" in result.flags
+            assert not result.success
+
+    @needs_a_front_end
+    @pytest.mark.parametrize("m", [20, 100])
+    def test_random_matches_into_estimate(self, m) -> None:
+        x1, x2 = np.random.default_rng(m).uniform([0, 0], SIZE, (2, m, 2))
+        result = eg.estimate_fundamental(x1, x2)
+        assert "no common geometry" in result.flags
+        assert not result.success
+        assert result.threshold_px < 0.03 * max(SIZE)
+
+    def test_many_points_matched_to_one_agree_with_any_line_through_it(self) -> None:
+        rng = np.random.default_rng(0)
+        x1, x2 = rng.uniform([0, 0], SIZE, (2, 60, 2))
+        x2[:40] = x2[0]
+        assert not eg.refine_fundamental(x1, x2).success
+
+
+class TestCopies:
+    @pytest.mark.parametrize(("n", "times"), [(8, 2), (12, 3), (60, 4)])
+    def test_count_once(self, n, times) -> None:
+        view = eg.two_view_scene(4.0, n_points=n, noise_px=0.5, seed=n)
+        rows = np.random.default_rng(1).permutation(np.repeat(np.arange(n), times))
+        first = np.sort(np.unique(rows, return_index=True)[1])
+        x1, x2 = view.x1[rows], view.x2[rows]
+        once = eg.refine_fundamental(x1[first], x2[first])
+        many = eg.refine_fundamental(x1, x2)
+        batch = eg.refine_fundamental_batch(x1, x2, [0, len(x1)])
+        np.testing.assert_allclose(many.F, once.F, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(batch.F[0], once.F, rtol=0, atol=1e-9)
+        for found in (many, batch):
+            assert np.ravel(found.noise_px)[0] == pytest.approx(once.noise_px, rel=1e-6)
+        np.testing.assert_allclose(many.covariance, once.covariance, rtol=1e-4, atol=1e-30)
+        assert many.flags == batch.flags[0] == once.flags
+        assert len(many.fun) == len(x1)
+
+    def test_seven_different_ones_are_too_few_in_every_entry(self, tmp_path) -> None:
+        view = eg.two_view_scene(4.0, n_points=7, seed=2)
+        x1, x2 = np.tile(view.x1, (4, 1)), np.tile(view.x2, (4, 1))
+        with pytest.raises(eg.ArgumentError, match="hold 7 different matches"):
+            eg.refine_fundamental(x1, x2)
+        with pytest.raises(eg.ArgumentError, match="hold 7 different matches"):
+            eg.estimate_fundamental(x1, x2)
+        batch = eg.refine_fundamental_batch(x1, x2, [0, 28])
+        assert "7 different matches" in batch.reasons[0]
+        assert not batch.success[0]
+        file = write(tmp_path / "d.db", x1 + 640.0, x2 + 640.0, camera=PINHOLE)
+        assert eg.colmap.refine_database(file).verdict == ("skipped",)
+
+    def test_the_largest_weight_of_equal_matches_counts(self) -> None:
+        view = eg.two_view_scene(4.0, n_points=30, seed=3)
+        w = np.linspace(0.5, 2.0, 30)
+        x1, x2 = np.tile(view.x1, (2, 1)), np.tile(view.x2, (2, 1))
+        twice = eg.refine_fundamental(x1, x2, weights=np.concatenate([w, 0.1 * w]))
+        once = eg.refine_fundamental(view.x1, view.x2, weights=w)
+        assert twice.cost == pytest.approx(once.cost, rel=1e-9)
+
+
+class TestLenses:
+    @pytest.mark.parametrize(
+        ("model", "extra", "verdict"),
+        [
+            (4, [-0.28, 0.07, 2e-4, 1e-4], "distorted"),  # OPENCV
+            (4, [0.0] * 4, "refined"),
+            (2, [-0.1], "distorted"),  # SIMPLE_RADIAL
+            (2, [1e-6], "refined"),
+            (10, [0.0] * 8, "distorted"),  # THIN_PRISM_FISHEYE, of which nothing else is known
+        ],
+    )
+    def test_distorted_cameras_are_told(self, tmp_path, model, extra, verdict) -> None:
+        view = eg.two_view_scene(3.0, n_points=80, noise_px=0.2, seed=4)
+        focal = [500.0] if model == 2 else [500.0, 500.0]
+        camera = (model, np.array([*focal, 640.0, 480.0, *extra]))
+        centre = np.array([640.0, 480.0])
+        file = write(tmp_path / "d.db", view.x1 + centre, view.x2 + centre, camera=camera)
+        result = eg.colmap.refine_database(file, write=True, backup=False)
+        assert result.verdict == (verdict,)
+        assert result.stored.any() == (verdict == "refined")
+        assert ("distorted cameras" in result.note[0]) == (verdict == "distorted")
+
+
+class TestCommands:
+    def test_a_loaded_result_is_the_saved_one(self, tmp_path) -> None:
+        view = eg.two_view_scene(4.0, seed=1)
+        for result in (
+            eg.refine_fundamental(view.x1, view.x2),
+            eg.refine_fundamental(*plane(50, 0, seed=1)),
+        ):
+            for name in ("r.npz", "r.json"):
+                eg.save_result(tmp_path / name, result, source=["a", "b"])
+                found = eg.load_result(tmp_path / name)
+                np.testing.assert_array_equal(found["F"], result.F)
+                assert found["flags"] == result.flags
+                assert found["success"] is result.success
+                assert found["message"] == result.message
+                assert list(found["source"]) == ["a", "b"]
+            assert f"flags={result.flags}" in repr(result)
+
+    def test_coordinates_that_are_no_pixels_are_told(self) -> None:
+        view = eg.two_view_scene(4.0, noise_px=0.5, seed=1)
+        assert "not pixels" not in eg.refine_fundamental(view.x1, view.x2).flags
+        assert "not pixels" in eg.refine_fundamental(view.x1 / 1000, view.x2 / 1000).flags
+
+    @needs_a_front_end
+    def test_evidence_thinned_to_few_matches_does_not_raise(self) -> None:
+        for seed in range(4):
+            x1, x2 = np.random.default_rng(seed).uniform([0, 0], SIZE, (2, 20, 2))
+            assert "no common geometry" in eg.estimate_fundamental(x1, x2).flags
