@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._library import address, library
+from epigauge.errors import BackendError
 
 __all__ = [
     "BLOCK",
@@ -26,6 +27,7 @@ __all__ = [
     "Envelope",
     "Refinement",
     "aligned_zeros",
+    "check_sizes",
     "checked",
     "function",
 ]
@@ -131,10 +133,39 @@ _TYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
 }
 
 
+def check_sizes(structures: dict[str, type[ctypes.Structure]]) -> None:
+    """Compare structures with those of the C library by their names there.
+
+    Raises
+    ------
+    BackendError
+        If one has another size.
+    """
+    size = library().eg_shared_size
+    size.restype, size.argtypes = _N, (ctypes.c_char_p,)
+    for name, structure in structures.items():
+        if size(name.encode()) != ctypes.sizeof(structure):
+            remedy = "install epigauge again to rebuild it"
+            raise BackendError("c", f"has another {name} than this Python code", remedy)
+
+
+@cache
+def _checked_library() -> ctypes.CDLL:
+    check_sizes(
+        {
+            "eg_bundle": Bundle,
+            "eg_envelope": Envelope,
+            "eg_refinement": Refinement,
+            "eg_bundle_options": BundleOptions,
+        }
+    )
+    return library()
+
+
 @cache
 def function(name: str) -> Any:
     """Return a function of the C library; calls release the global interpreter lock."""
-    found = getattr(library(), f"eg_{name}")
+    found = getattr(_checked_library(), f"eg_{name}")
     found.restype, found.argtypes = _TYPES[name]
     return found
 

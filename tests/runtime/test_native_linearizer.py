@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from epigauge import kernels, lm
+from epigauge import _native, kernels, lm
 from epigauge.bundle import lanes
 from epigauge.bundle.dampings import Covariant, Levenberg
 from epigauge.bundle.freedom import Freedom
@@ -19,6 +20,7 @@ from epigauge.bundle.run import bundle_problem
 from epigauge.bundle.skyline import Skyline, narrow
 from epigauge.bundle.ties import Ties
 from epigauge.cameras import CameraModel, camera_model, models
+from epigauge.errors import BackendError
 from epigauge.two_view.losses import LOSSES, Loss
 from laws import distance
 
@@ -313,6 +315,15 @@ class TestSkyline:
         held = np.zeros((n, n), np.bool_)
         held[rows, columns] = held[columns, rows] = True
         assert (held | ~together[np.ix_(order, order)]).all()
+
+
+def test_structures_of_another_size_are_refused() -> None:
+    class Longer(ctypes.Structure):
+        _fields_ = (*_native.Envelope._fields_, ("more", ctypes.c_double))
+
+    _native.check_sizes({"eg_envelope": _native.Envelope})
+    with pytest.raises(BackendError, match="eg_envelope"):
+        _native.check_sizes({"eg_envelope": Longer})
 
 
 class TestCompiledLoop:

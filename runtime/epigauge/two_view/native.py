@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from epigauge import lm
 from epigauge._library import address, library
+from epigauge._native import check_sizes
 from epigauge.two_view.conditioning import OFFSET, RMS, Conditioning
 from epigauge.two_view.essential import Essential
 from epigauge.two_view.losses import LOSSES
@@ -71,6 +72,7 @@ class _Outcome(ctypes.Structure):
 
 @cache
 def _functions() -> tuple[Any, Any]:
+    check_sizes({"eg_options": _Options, "eg_outcome": _Outcome})
     pointer, size = ctypes.c_void_p, ctypes.c_ssize_t
     one, many = library().eg_minimize_matches, library().eg_refine_pairs
     one.argtypes = [size, *[pointer] * 4, ctypes.c_int, *[pointer] * 5]
