@@ -22,7 +22,7 @@ MODULES = {
         f"epigauge.{name}": importlib.import_module(f"epigauge.{name}")
         for name in (
             *("casadi", "colmap", "datasets", "errors", "images", "interop", "io", "kernels"),
-            *("plots", "reports"),
+            *("plots", "reports", "verdicts"),
         )
     },
 }

@@ -124,7 +124,7 @@ def test_a_run_that_does_not_converge_exits_1_and_still_answers(run, pair_file) 
     code, out, err = run("refine", pair_file, "--max-iter", 1)
     assert code == 1
     assert numbers(out).shape == (3, 3)
-    assert "did not converge" in err
+    assert "not converged" in err
     code, out, _ = run("refine", pair_file, "--max-iter", 1, "--json")
     assert code == 1
     assert document(out)["success"] is False

@@ -246,7 +246,7 @@ def test_epipoles_are_told_inside_outside_and_at_infinity() -> None:
 
 
 def test_every_failure_is_explained_in_a_sentence() -> None:
-    result = dataclasses.replace(SIDEWAYS[0], rank=5, success=False, message="no more steps")
+    result = dataclasses.replace(SIDEWAYS[0], rank=5, status=0, message="no more steps")
     sentences = explained(result)
     assert sentences["rank"] == "The matches determine only 5 of the 7 directions of F."
     assert sentences["not converged"] == "No more steps."

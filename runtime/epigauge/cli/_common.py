@@ -96,7 +96,7 @@ def warn(out: Console, result: eg.FundamentalResult) -> None:
         text = f"the matches determine only {result.rank} of the 7 directions of F"
         out.print(f"[bold red]rank:[/] {text}", soft_wrap=True)
     if result.status <= 0:
-        out.print(f"[bold red]did not converge:[/] {escape(result.message)}", soft_wrap=True)
+        out.print(f"[bold red]not converged:[/] {escape(result.message)}", soft_wrap=True)
 
 
 def shown(path: Path) -> str:
