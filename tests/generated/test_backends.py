@@ -41,10 +41,11 @@ def pool(values, batch, rng):
     return np.stack(chosen, axis=-1).reshape(own + batch) if count else np.empty(own + batch)
 
 
-def definite(batch, rng):
-    """Return upper triangles of positive definite 4x4 matrices."""
-    root = rng.standard_normal((*batch, 4, 6))
-    upper = (root @ root.swapaxes(-1, -2))[..., *np.triu_indices(4)]
+def definite(batch, rng, entries):
+    """Return upper triangles, of so many entries, of positive definite matrices."""
+    rows = {6: 3, 10: 4}[entries]
+    root = rng.standard_normal((*batch, rows, rows + 2))
+    upper = (root @ root.swapaxes(-1, -2))[..., *np.triu_indices(rows)]
     return np.moveaxis(upper, -1, 0)
 
 
@@ -86,11 +87,11 @@ def inputs(name, batch, seed, F=None):
         "scale2": lambda: 0.7,
         "eta": lambda: 0.3,
         "damping": lambda: np.array([0.3, 0.2, 0.5, 0.4]),
-        "N": lambda: definite(batch, rng),
-        "W": lambda: definite(batch, rng),
+        "N": lambda: definite(batch, rng, shapes["N"][0]),
+        "W": lambda: definite(batch, rng, shapes["W"][0]),
         "lam": lambda: rng.uniform(0.0, 1.0, batch if lam_each else ()),
     }
-    wanted = {argument.name for argument in signature.inputs}
+    wanted = set(shapes)
     if wanted >= set(FRAME):
         special |= {key: (lambda value=value: value) for key, value in frame.items()}
     elif "q1" in wanted:

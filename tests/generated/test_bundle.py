@@ -156,6 +156,7 @@ def test_kernels_are_those_of_the_model():
         "coupling",
         "least_eigenvector",
         "inverse_root",
+        "inverse_root3",
         "damped_inverse_root",
         "point_step",
     }

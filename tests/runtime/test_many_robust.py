@@ -9,6 +9,7 @@ import many_views
 import numpy as np
 import pytest
 from epigauge import kernels
+from epigauge.bundle.observations import ObservationGraph
 from epigauge.multi_view.agreement import agreed_camera, agreed_fundamental, agreed_points
 from epigauge.multi_view.frame import Frame
 from laws import distance
@@ -143,8 +144,10 @@ def test_points_that_most_lines_of_sight_agree_on() -> None:
     first = np.searchsorted(clean.point, np.arange(80))
     xy[first + np.arange(80) % 6] += [150.0, -90.0]
     tracks = eg.Tracks(clean.view, clean.point, xy)
-    problem = many_views.problem_of(tracks)
+    graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+    q = np.ascontiguousarray(tracks.xy.T / 1000.0)
     P, Q = many_views.in_units(truth)
-    found = agreed_points(problem, P, np.ones_like(Q), 1e-3)
+    parts = kernels.table(), graph, q, np.array(tracks.weights)
+    found = agreed_points(*parts, P, np.ones_like(Q), 1e-3)
     h, expected = (np.einsum("nij,nj->ni", P[tracks.view], X[tracks.point]) for X in (found, Q))
     assert distance(h[:, :2] / h[:, 2:], expected[:, :2] / expected[:, 2:]) < 1e-3

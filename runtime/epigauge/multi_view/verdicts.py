@@ -151,7 +151,7 @@ def judged(
     # Where the fit is bad, nothing is within its noise.
     fits = noise_px < _FITS * Frame.of(tracks).scale
     raised = set(parallax_flags(seen, noise_px)) if fits else set()
-    extent = float(np.ptp(seen.xy, axis=0).max())
+    extent = _extent(seen.xy)
     usual = _HEAVY * max(noise_px, _EXACT * extent)
     heavy = float(np.sqrt(np.mean(distances**2) / 2.0)) > usual
     if bends and (heavy or distances.max() > max(_BEYOND * extent, usual)):
@@ -163,6 +163,12 @@ def judged(
     if n_behind > BEHIND * N:
         raised.add("behind the cameras")
     return Verdict(ordered(raised), full - of_cameras - of_points, n_behind)
+
+
+def _extent(xy: Array) -> float:
+    """Return the range of the coordinates, to which a few wild ones add little."""
+    low, high = np.quantile(xy, (0.005, 0.995), axis=0)
+    return float(np.minimum(np.ptp(xy, axis=0), 1.3 * (high - low)).max())
 
 
 def judged_metric(
