@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LAM_FLOOR", "Arrow", "Dense", "Levenberg", "Seber"]
+__all__ = ["Arrow", "Dense", "Levenberg", "Seber"]
 
 Array = NDArray[np.float64]
 
@@ -41,6 +41,8 @@ _BENT = 0.375**2
 class Levenberg:
     """Damping lambda I, called LM in B&S; the first lambda is relative to the diagonal."""
 
+    lam_floor = LAM_FLOOR
+
     relative: float = 1e-3
 
     def start(self, system: _Solvable) -> float:
@@ -55,6 +57,8 @@ class Levenberg:
 @dataclass(frozen=True)
 class Seber:
     """Damping lambda diag(J^T J), called SEBER in B&S: the diagonal is multiplied by 1 + lambda."""
+
+    lam_floor = LAM_FLOOR
 
     relative: float = 1e-3
 

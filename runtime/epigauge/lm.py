@@ -53,10 +53,6 @@ STATUS = {
 
 _LAM_CEILING = 1e16
 
-#: Least lambda over the first. Below, rounding decides on steps along directions that a flat scene
-#: hardly determines: other ones in every basis. Nothing is gained there: no run takes more steps.
-_LAM_FLOOR = 1e-8
-
 #: Most trial steps: the compiled loop keeps a row for each.
 _MAX_ITER = 1_000_000
 
@@ -257,7 +253,6 @@ def minimize(
     stopping: Stopping,
     callback: Callable[[Row], object] | None = None,
     scale: float = 1.0,
-    lam_floor: float = _LAM_FLOOR,
 ) -> Outcome[S]:
     """Minimise a cost by damped steps.
 
@@ -271,7 +266,8 @@ def minimize(
     start : object
         Where to begin: an estimate of the problem.
     damping : Damping
-        Turns a linear system and lambda into a step.
+        Turns a linear system and lambda into a step; lambda stays above its `lam_floor` times the
+        first one, if it has one.
     schedule : Schedule
         Accepts or rejects the step and gives the next lambda.
     stopping : Stopping
@@ -280,8 +276,6 @@ def minimize(
         Called with each `Row`; a true return value stops the minimisation.
     scale : float
         Factor from the problem's cost to the unit that the history is told in.
-    lam_floor : float
-        Least lambda, over the first one.
 
     Returns
     -------
@@ -300,6 +294,8 @@ def minimize(
     - ``c <= problem.floor`` (5), or a step neither lowers nor raises the cost beyond
       ``1e-15 * c`` (2): then rounding decides.
     """
+    # Only a damping whose lambda has no unit can say which one is too small.
+    lam_floor: float = getattr(damping, "lam_floor", 0.0)
     compiled = getattr(problem, "compiled", None)
     if compiled is not None and callback is None:
         done = compiled(start, damping, schedule, stopping, scale, lam_floor)

@@ -36,6 +36,8 @@ SHAPES = [(4, 20, 0.7), (3, 6, 1.0), (5, 101, 0.01), (70, 30, 0.5), (12, 300, 0.
 
 #: A value of every parameter of a camera that sees a scene at a distance of six units well.
 _FOCAL = {"f": 500.0, "fx": 510.0, "fy": 490.0, "c": 500.0, "cx": 320.0, "cy": 240.0, "R0": 100.0}
+#: Coefficients of `brown` multiply powers of the radius in pixels.
+_FOCAL |= {"A1": 1e-8, "A2": 1e-14, "A3": 1e-20, "B1": 1e-6, "B2": 1e-6}
 _SMALL = 1e-3
 
 
@@ -75,7 +77,7 @@ def scene(
     R = turned * np.linalg.det(turned)[:, None, None]
     R = R * np.sign(np.einsum("nii->ni", R))[:, :, None]
     R *= np.linalg.det(R)[:, None, None]
-    ahead = -6.0 if model.name == "bal" else 6.0
+    ahead = -6.0 if model.name in ("bal", "brown") else 6.0
     t = 0.3 * rng.standard_normal((n, 3)) + [0.0, 0.0, ahead]
     P, X = np.concatenate([R, t[:, :, None]], axis=2), rng.uniform(-1.0, 1.0, (m, 3))
     if not model.metric:

@@ -35,6 +35,10 @@ START = 1e-3
 #: The same for the covariant damping of metric cameras, which holds points by their mean entry.
 START_METRIC = 1e-4
 
+#: Least lambda over the first, where W scales with the system. Below, rounding decides on steps
+#: along directions that a flat scene hardly determines: other ones in every basis.
+LAM_FLOOR = 1e-8
+
 #: Least diagonal entry of lambda diag(N), of the mean of its block.
 _LEAST = 1e-6
 
@@ -87,6 +91,8 @@ class Covariant(ByMatrix):
     for every T~. Metric: diag(N) of each camera, whose update is in its own frame, and the trace of
     each point's block. Affine: blockdiag(N).
     """
+
+    lam_floor = LAM_FLOOR
 
     def start(self, system: BundleSystem) -> float:
         """Return the first lambda."""

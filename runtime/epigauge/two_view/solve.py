@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from epigauge import lm
 from epigauge.kernels import Table
-from epigauge.linear import LAM_FLOOR, Levenberg, Seber
+from epigauge.linear import Levenberg, Seber
 from epigauge.two_view import native
 from epigauge.two_view.conditioning import Conditioning, condition, displaced
 from epigauge.two_view.criteria import CRITERIA, Criterion, Mahalanobis, Reprojection
@@ -237,7 +237,6 @@ def _minimize_once(
         options.stopping,
         callback,
         matches.frame.scale**2,
-        LAM_FLOOR,
     )
     if options.parameterization in REDUNDANT:
         assert not isinstance(problem, EliminatedProblem)
