@@ -164,12 +164,9 @@ def estimate_fundamental(
 
     options.setdefault("noise_px", None)
     limit = threshold / frame.scale if threshold is not None else _at_most(agreement.mixture.even)
-    inlier = agreement.inliers(limit)
+    inlier = _at_least(least, agreement, limit)
     fitted: set[bytes] = set()
     while inlier.tobytes() not in fitted and len(fitted) < _ROUNDS:
-        if np.count_nonzero(inlier) < least:  # the nearest, for a result that says it means nothing
-            inlier = np.zeros(len(inlier), np.bool_)
-            inlier[np.argsort(np.abs(agreement.signed))[:least]] = True
         fitted.add(inlier.tobytes())
         used, limit_px = inlier, limit * frame.scale
         start = frame.to_pixels(agreement.F)
@@ -180,7 +177,7 @@ def estimate_fundamental(
         if threshold is None:
             sigma = robust_scale(agreement.signed[used])
             limit = min(limit, max(_DEVIATIONS * sigma, 1e-9))
-        inlier = agreement.inliers(limit)
+        inlier = _at_least(least, agreement, limit)
     known = {
         entry.name: getattr(refined, entry.name)
         for entry in fields(refined)
@@ -217,6 +214,15 @@ def _judged(
 ) -> SimpleNamespace:
     """Return flags and success, by all matches: those that agree within a limit, and the others."""
     return refined.judged(refined._evidence.among(raw.x1, raw.x2, raw.weights, agreeing, limit_px))
+
+
+def _at_least(count: int, agreement: Agreement, limit: float) -> Mask:
+    """Return the inliers, or so many nearest matches for a result that says it means nothing."""
+    inlier = agreement.inliers(limit)
+    if np.count_nonzero(inlier) < count:
+        inlier = np.zeros(len(inlier), np.bool_)
+        inlier[np.argsort(np.abs(agreement.signed))[:count]] = True
+    return inlier
 
 
 def _at_most(limit: float) -> float:
