@@ -128,9 +128,9 @@ def test_degenerate_results_are_drawn(tmp_path, distances, rows) -> None:
     x1 = scene.x1.copy()
     if distances == "outlier":
         x1[0] += 30.0
-    result = dataclasses.replace(
-        RESULT, F=scene.F_true, history=RESULT.history[:rows], success=False, message="no luck"
-    )
+    # The status says whether it converged; `success` is false for a degenerate scene, too.
+    failed = {"status": 0, "success": False, "message": "no luck"}
+    result = dataclasses.replace(RESULT, F=scene.F_true, history=RESULT.history[:rows], **failed)
     figure = plot_refinement(result, x1, scene.x2)
     assert "not converged: no luck" in figure.get_suptitle()
     save_figure(figure, tmp_path / "picture.png")
