@@ -220,7 +220,8 @@ def recelled(data: bytes, random: Random) -> bytes:
 def kinds() -> dict[str, Kind]:
     """Return every kind of file that a command reads, by its name."""
     text = (renumbered, relined)
-    pair = eg.two_view_scene(n_points=20, noise_px=0.5, seed=1)
+    # Near enough for 20 matches to show parallax: a flagged result would end with 1.
+    pair = eg.two_view_scene(3.0, n_points=20, noise_px=0.5, seed=1)
     many = eg.multi_view_scene(n_views=4, n_points=15, visible=0.8, noise_px=0.5, seed=2)
     t = many.tracks  # BAL has the axes of the image the other way round
     upside_down = eg.Reconstruction(np.diag([-1.0, -1.0, 1.0]) @ many.true.P, many.true.Q)
