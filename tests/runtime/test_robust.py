@@ -219,8 +219,11 @@ def test_options_reach_the_refinement_and_those_of_matches_are_selected():
 def test_measured_pairs_agree_with_what_their_makers_call_right(pair):
     with np.load(pair) as data:
         x1, x2, inlier = data["x1"], data["x2"], data["inlier"]
+        planes = np.unique(data["label"][data["label"] > 0]) if "label" in data else ()
     result = eg.estimate_fundamental(x1, x2)
-    assert result.success
+    assert result.status > 0
+    # Where all right matches bear the label of one plane, the makers call the scene flat.
+    assert result.success or (len(planes) == 1 and result.flags == ("planar scene",))
     # They drop duplicates and took another threshold, for the whole image or per plane.
     assert np.mean(result.inlier[inlier]) > 0.75
 
