@@ -232,7 +232,12 @@ def as_calibration(name: str, K: ArrayLike) -> Array:
         raise ArgumentError(
             name, "is no calibration matrix", "[[fx, s, cx], [0, fy, cy], [0, 0, 1]]"
         )
-    return np.asarray(matrix / matrix[2, 2])
+    scaled = np.asarray(matrix / matrix[2, 2])
+    if not np.abs(scaled).max() <= MAX_PX:
+        raise ArgumentError(
+            name, f"has an entry of {np.abs(scaled).max():g}", f"pixels, up to {MAX_PX:g}"
+        )
+    return scaled
 
 
 def as_positive(name: str, value: object, *, zero: bool = False) -> float:

@@ -61,7 +61,7 @@ def test_errors_that_differ_by_a_few_millionths_are_not_the_same(above: float, s
 
 def test_coordinates_on_the_retina_are_those_of_calibrated_cameras() -> None:
     scene = eg.two_view_scene(6.0, seed=1)
-    q1, q2 = essential._retina(scene).forward(scene.x1, scene.x2)
+    q1, q2 = essential._retina(scene, "retina", np.eye(3)).forward(scene.x1, scene.x2)
     for q, x in ((q1, scene.x1), (q2, scene.x2)):
         h = np.linalg.solve(scene.K, np.vstack([x.T, np.ones(len(x))]))
         np.testing.assert_allclose(q, h[:2] / h[2], rtol=0.0, atol=1e-15)

@@ -83,7 +83,7 @@ def diagnosed(
     gauge = _free_gauge(system, kernels) if fixes_gauge else system.model.gauge_dimension
     nothing = np.zeros((n, d))
     if not system.normal.coupling.direct:
-        return Diagnosis(unknowns - gauge - of_points, 0, float("nan"), nothing)
+        return Diagnosis(unknowns - gauge - of_points, 0, float("inf"), nothing)
     parts = system.normal, ties, system.own_roots(T), None
     shifted, _ = reduced_system(*parts, white + _SHIFT * np.eye(a), _SHIFT)
     count = min(gauge + _COLUMNS, n * a - frozen + r)

@@ -67,12 +67,12 @@ class BundleResult:
     rejected : ndarray of bool, shape (N,)
         Observations that were set aside as gross errors, in the order of the tracks.
     condition : float
-        Of metric cameras, beside the gauge: inverse of the least eigenvalue of the reduced normal
-        matrix scaled to a unit diagonal; infinite where something is undetermined, NaN where the
-        system was not factored, and for projective cameras.
+        Beside the gauge, the inverse of the least eigenvalue of the reduced normal matrix: of
+        metric cameras scaled to a unit diagonal, of projective ones where the W of the covariant
+        damping is one. Infinite where something is undetermined or the system could not be factored.
     weakest : str
-        The direction of that eigenvalue: its three largest standard deviations, as shares of a
-        radian, of the scene's size, or of the focal length.
+        Of metric cameras the direction of that eigenvalue: its three largest standard deviations,
+        as shares of a radian, of the scene's size, or of the focal length.
     nfev, njev, nit, status, message, success, history
         As in `FundamentalResult`.
     """

@@ -98,7 +98,7 @@ class Verdict:
     flags: tuple[str, ...]
     rank: int
     n_behind: int
-    condition: float = float("nan")
+    condition: float = float("inf")
     weakest: str = ""
 
 
@@ -162,7 +162,8 @@ def judged(
         raised.add("weak geometry")
     if n_behind > BEHIND * N:
         raised.add("behind the cameras")
-    return Verdict(ordered(raised), full - of_cameras - of_points, n_behind)
+    condition = float("inf") if of_cameras or not weakest > 0.0 else 1.0 / weakest
+    return Verdict(ordered(raised), full - of_cameras - of_points, n_behind, condition)
 
 
 def _extent(xy: Array) -> float:
@@ -205,7 +206,7 @@ def judged_metric(
     n_behind = int(np.count_nonzero(~(found.depths(tracks) > 0.0)))
     raised = ["behind the cameras"] if n_behind > BEHIND * len(tracks) else []
     system, rank = outcome.system, 0
-    condition, weakest = float("nan"), ""
+    condition, weakest = float("inf"), ""
     if isinstance(system, BundleSystem) and np.isfinite(outcome.state.cost):
         diagnosis = diagnosed(system, kernels, known, fixes_gauge)
         rank, condition = diagnosis.rank, diagnosis.condition
