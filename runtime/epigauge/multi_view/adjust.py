@@ -69,7 +69,7 @@ class BundleResult:
     condition : float
         Beside the gauge, the inverse of the least eigenvalue of the reduced normal matrix: of
         metric cameras scaled to a unit diagonal, of projective ones where the W of the covariant
-        damping is one. Infinite where something is undetermined or the system could not be factored.
+        damping is one. Infinite where something is undetermined or the system is not factored.
     weakest : str
         Of metric cameras the direction of that eigenvalue: its three largest standard deviations,
         as shares of a radian, of the scene's size, or of the focal length.
