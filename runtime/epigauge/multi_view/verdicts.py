@@ -64,9 +64,11 @@ _HEAVY = 8.0
 #: Noise below this share of the extent of the coordinates is rounding.
 _EXACT = 1e-8
 
-#: Least squares bends everything to an observation whose residual, as a share of the extent of the
-#: coordinates, is larger: below a fifth in raw tracks, above with two wrong in a thousand.
-_BEYOND = 0.2
+#: Least squares bends everything to observations whose residuals, as shares of the extent of the
+#: coordinates, are larger than the first: below a fifth in most raw tracks, above with two wrong in
+#: a thousand. So few as the second cannot: one of 35000 measured ones is off by a third of the
+#: extent, and they lead to the published optimum all the same.
+_BEYOND, _TOO_FEW = 0.2, 1e-4
 
 #: Share of single points that may be open without the rest being called undetermined.
 _OPEN = 0.05
@@ -154,7 +156,8 @@ def judged(
     extent = _extent(seen.xy)
     usual = _HEAVY * max(noise_px, _EXACT * extent)
     heavy = float(np.sqrt(np.mean(distances**2) / 2.0)) > usual
-    if bends and (heavy or distances.max() > max(_BEYOND * extent, usual)):
+    beyond = np.count_nonzero(distances > max(_BEYOND * extent, usual))
+    if bends and (heavy or beyond > _TOO_FEW * N):
         raised.add("gross errors")
     if of_cameras or of_points > _OPEN * seen.m:
         raised.add("undetermined")
