@@ -41,9 +41,6 @@ class TooFewInCommon(ArgumentError):
 #: Pairs of views, those with most common points, that are tried as a start, and the fewest points.
 _PAIRS, _MATCHES = 40, 8
 
-#: Robust registration adjusts what it has when the number of cameras has grown by this factor.
-_GROWTH = 1.25
-
 #: Points of a pair that its parallax is measured by, where that is robust.
 _FEW = 300
 
@@ -70,7 +67,7 @@ def registered(
     incremental : bool
         Adjust everything known with each camera.
     robust : bool
-        Take what most observations agree on, and adjust as the number of cameras grows.
+        Take what most observations agree on, and adjust everything known with each camera.
 
     Returns
     -------
@@ -85,14 +82,11 @@ def registered(
     tracks = counted(tracks)
     builder = _Builder(tracks, frame.conditioned(tracks), kernels, robust)
     builder.begin(*_best_pair(tracks, frame, robust))
-    adjusted = 2
     while not builder.registered.all():
         builder.register(builder.next_view())
-        known = int(np.count_nonzero(builder.registered))
-        # Gross errors bend what hangs on a few cameras: these are adjusted as their number grows.
-        if incremental or (robust and (known >= _GROWTH * adjusted or known == tracks.n_views)):
+        # Gross errors bend what hangs on a few cameras, and at the end of a long sequence it does.
+        if incremental or robust:
             builder.adjust()
-            adjusted = known
     return Reconstruction(frame.cameras_out(builder.P), builder.Q)
 
 
