@@ -10,6 +10,7 @@ import re
 import socket
 import subprocess
 import sys
+import types
 from dataclasses import replace
 from pathlib import Path
 
@@ -167,9 +168,11 @@ def test_a_changed_formula_changes_every_language_and_fails_the_check(
 @pytest.fixture(scope="module")
 def signatures(files):
     """Return the generated table of kernels."""
-    space = {"__name__": "signatures"}
-    exec(files["epigauge_generated/signatures.py"], space)
-    return space["SIGNATURES"]
+    module = types.ModuleType("signatures")
+    with pytest.MonkeyPatch.context() as patch:  # its dataclasses look their module up by name
+        patch.setitem(sys.modules, module.__name__, module)
+        exec(files["epigauge_generated/signatures.py"], module.__dict__)
+    return module.SIGNATURES
 
 
 def headers(name, family, files):
@@ -245,8 +248,8 @@ def test_counts_in_headers_are_those_of_the_code(files, signatures):
         header = headers(name, family, files)[path]
         stated = re.search(r"Operations: (\d+), temporaries: (\d+)", header)
         assert len(names) == int(stated[2]), name
-        # SymPy counts a power as one operation, which is printed as one or two.
-        assert operations == pytest.approx(int(stated[1]), rel=0.1, abs=4), name
+        # SymPy counts a power as one operation, which is printed as one or two (R0^6: as five).
+        assert operations == pytest.approx(int(stated[1]), rel=0.1, abs=8), name
 
 
 def test_first_line_says_where_a_file_comes_from_and_not_to_edit_it(files):
