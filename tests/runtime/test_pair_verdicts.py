@@ -156,6 +156,7 @@ class TestCopies:
         assert many.flags == batch.flags[0] == once.flags
         assert len(many.fun) == len(x1)
 
+    @needs_a_front_end
     def test_seven_different_ones_are_too_few_in_every_entry(self, tmp_path) -> None:
         view = eg.two_view_scene(4.0, n_points=7, seed=2)
         x1, x2 = np.tile(view.x1, (4, 1)), np.tile(view.x2, (4, 1))
