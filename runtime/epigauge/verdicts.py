@@ -128,6 +128,16 @@ FLAGS = {
 def ordered(names: Iterable[str]) -> tuple[str, ...]:
     """Return names of flags, each once, in the order of `FLAGS`.
 
+    Parameters
+    ----------
+    names : iterable of str
+        Flags that were raised.
+
+    Returns
+    -------
+    tuple of str
+        The same in order.
+
     Raises
     ------
     KeyError
@@ -158,7 +168,18 @@ def usable(names: Iterable[str], kind: Kind) -> bool:
 
 
 def explained(names: Iterable[str]) -> dict[str, str]:
-    """Return each flag with a text for people: what was found, and what to do."""
+    """Return each flag with a text for people: what was found, and what to do.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Flags that were raised.
+
+    Returns
+    -------
+    dict of str to str
+        Two sentences a flag.
+    """
     return {
         name: f"{_capital(FLAGS[name].sentence)}. {_capital(FLAGS[name].remedy)}." for name in names
     }

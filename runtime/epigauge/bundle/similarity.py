@@ -35,21 +35,61 @@ class Similarity:
     target: Array
 
     def inverse(self) -> Similarity:
-        """Return the similarity that undoes this one."""
+        """Return the similarity that undoes this one.
+
+        Returns
+        -------
+        Similarity
+            The inverse.
+        """
         return Similarity(1.0 / self.scale, self.rotation.T, self.target, self.origin)
 
     def positions(self, X: Array) -> Array:
-        """Return moved positions (m, 3)."""
+        """Return moved positions.
+
+        Parameters
+        ----------
+        X : ndarray, shape (m, 3)
+            Positions.
+
+        Returns
+        -------
+        ndarray, shape (m, 3)
+            Where they go.
+        """
         return np.asarray(self.scale * (X - self.origin) @ self.rotation.T + self.target)
 
     def information(self, blocks: Array) -> Array:
-        """Return moved inverse covariances of positions, (k, 3, 3)."""
+        """Return moved inverse covariances of positions.
+
+        Parameters
+        ----------
+        blocks : ndarray, shape (k, 3, 3)
+            Inverse covariances.
+
+        Returns
+        -------
+        ndarray, shape (k, 3, 3)
+            Those of the moved positions.
+        """
         return np.asarray(self.rotation @ blocks @ self.rotation.T / self.scale**2)
 
     def apply(self, cameras: Array, points: Array) -> tuple[Array, Array]:
-        """Return moved cameras (n, c), rows (R | t) and intrinsics, and points (m, 3).
+        """Return moved cameras and points.
 
         No image changes: R <- R rotation^T, and the centres move as the points do.
+
+        Parameters
+        ----------
+        cameras : ndarray, shape (n, c)
+            Rows (R | t) and intrinsics.
+        points : ndarray, shape (m, 3)
+            Points.
+
+        Returns
+        -------
+        tuple of ndarray
+            Cameras and points in the new frame.
         """
         pose = cameras[:, :12].reshape(-1, 3, 4)
         R = pose[:, :, :3] @ self.rotation.T
@@ -60,7 +100,18 @@ class Similarity:
         return moved, self.positions(points)
 
     def blocks(self, n: int, m: int, d: int) -> tuple[Array, Array]:
-        """Return what own tangents of cameras (n, d, d) and points (m, 3, 3) are multiplied by."""
+        """Return what own tangents are multiplied by.
+
+        Parameters
+        ----------
+        n, m, d : int
+            Numbers of cameras, of points, and of entries of a camera's tangent.
+
+        Returns
+        -------
+        tuple of ndarray, shape (n, d, d), (m, 3, 3)
+            Blocks of cameras and of points.
+        """
         scales = np.ones(d)
         scales[3:6] = self.scale
         return (
