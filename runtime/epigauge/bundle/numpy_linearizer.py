@@ -293,6 +293,8 @@ class DensePairs:
         S = blocks.transpose(0, 2, 1, 3).copy()
         S[np.arange(n), :, np.arange(n), :] += U
         S = S.reshape(n * a, n * a)
+        if not np.isfinite(S).all():
+            raise np.linalg.LinAlgError("the reduced system is not finite")
         np.linalg.cholesky(S)  # raises where S is not positive definite
         return DenseFactor(S)
 
