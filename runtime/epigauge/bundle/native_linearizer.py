@@ -35,6 +35,7 @@ from epigauge.bundle.numpy_linearizer import DENSE_CAMERAS
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.skyline import Skyline, SkylineFactor
 from epigauge.cameras import CameraModel
+from epigauge.errors import ArgumentError
 from epigauge.two_view.losses import Loss
 
 __all__ = ["NativeLinearizer"]
@@ -89,9 +90,11 @@ class NativeLinearizer:
         whole = np.arange(model.tangent_size)
         used = whole if columns is None or by_factors else np.unique(np.asarray(columns, np.intp))
         if len(used) > MOST_TANGENT:
-            raise NotImplementedError(
-                f"{model.name} has {len(used)} unknowns a camera, the C library at most "
-                f"{MOST_TANGENT}: backend='numpy' takes any"
+            raise ArgumentError(
+                "backend",
+                f"is 'c', which takes at most {MOST_TANGENT} unknowns a camera; {model.name} has "
+                f"{len(used)}",
+                "'numpy', which takes any",
             )
         #: None where all entries are computed with.
         self._used: Indices | None = None if len(used) == len(whole) else used
