@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -85,10 +85,13 @@ class Setup:
     distance: float = 10.0
     noise_px: float = 2.0**0.5
     n_points: int = 50
+    baseline: float = 1.0
+    focal: float = 1000.0
 
     def scene(self) -> TwoViewScene:
         """Return the scene."""
-        return two_view_scene(self.distance, self.noise_px, self.n_points, seed=self.seed)
+        configuration = asdict(self)
+        return two_view_scene(**configuration)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 
 from epigauge.reproduce.common import ELIMINATED, LM, METHODS, Setup, Study, converge
 from epigauge.reproduce.figures import Panel, curves
-from epigauge.reproduce.report import Claim, Picture, Section, Table
+from epigauge.reproduce.report import Claim, Picture, Section, Table, fewest
 
 __all__ = ["PAPER_SECONDS", "table2"]
 
@@ -91,7 +91,8 @@ def table2(study: Study) -> Section:
     def text(ratios: dict[str, float]) -> str:
         return ", ".join(f"{name} {ratios[name]:.2f}" for name in names[1:])
 
-    per_step = seconds["ORTHO eliminated, exact Hessian"] / ortho
+    cheapest = np.min([seconds[name] for name in names], axis=0)
+    per_step = seconds["ORTHO eliminated, exact Hessian"] / cheapest
     return Section(
         "Table 2: seconds per iteration",
         [
@@ -124,8 +125,8 @@ def table2(study: Study) -> Section:
             Claim(
                 "not in the paper",
                 "a step without structure parameters is cheaper than any",
-                bool(np.all(per_step <= 1.0)),
-                "ORTHO eliminated with exact Hessian over ORTHO: "
+                fewest(per_step.tolist(), [1.0] * len(per_step), 0.1),
+                "ORTHO eliminated with exact Hessian over the cheapest step with structure: "
                 + ", ".join(f"{r:.2f} at {m:,}" for r, m in zip(per_step, POINTS, strict=True)),
             ),
         ],

@@ -17,7 +17,16 @@ from epigauge.plots import save_figure
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Claim", "Picture", "Section", "Table", "lower", "write_report", "write_section"]
+__all__ = [
+    "Claim",
+    "Picture",
+    "Section",
+    "Table",
+    "fewest",
+    "lower",
+    "write_report",
+    "write_section",
+]
 
 Cell = str | int | float | None
 
@@ -102,6 +111,18 @@ def lower(ours: float, others: float, within: float) -> bool | None:
     if abs(ours - others) <= within * max(abs(ours), abs(others)):
         return None
     return ours < others
+
+
+def fewest(ours: Sequence[float], others: Sequence[float], within: float = 0.02) -> bool | None:
+    """Tell whether each of our numbers is lower than the other beside it.
+
+    Returns
+    -------
+    bool or None
+        False if any is higher, None if none is but some differ by less than a part.
+    """
+    verdicts = [lower(a, b, within) for a, b in zip(ours, others, strict=True)]
+    return False if False in verdicts else None if None in verdicts else True
 
 
 @dataclass(frozen=True)

@@ -144,12 +144,14 @@ def table3(study: Study) -> Section:
             Claim(
                 "Table 3, 5.1.3",
                 f"methods with minimal parameters fall into local minima more often ({case})",
-                bool(redundant > minimal),
+                lower(minimal, redundant, 0.01),
                 f"mean success: {numbers}",
             )
         )
-    near = standard[:, :2].min()
-    far = standard[:, -2:].max()
+    near, far = standard[:, :2].mean(), standard[:, -2:].mean()
+    trend = {True: "falls with", False: "grows with", None: "does not depend on"}
+    minimal = np.mean([PAPER_SUCCESS[name] for name in ("ORTHO", "MAPS")], axis=0)
+    near_there, far_there = minimal[:2].mean(), minimal[-2:].mean()
     return Section(
         "Table 3: success rates",
         [
@@ -163,9 +165,10 @@ def table3(study: Study) -> Section:
             Picture("table3", "Success against distance.", figure),
             table,
             stops,
-            f"With LM and xi = {XI:g} the lowest rate at 6 and 8 m is {near:.0f} % and the highest "
-            f"at 18 and 20 m is {far:.0f} %: what decides here is the distance. The paper has the "
-            "opposite trend for its minimal methods: ORTHO 83 % at 6 m and 99 % at 20 m.",
+            f"With LM and xi = {XI:g} the mean rate of all methods is {near:.0f} % at 6 and 8 m "
+            f"and {far:.0f} % at 18 and 20 m: it {trend[lower(far, near, 0.02)]} the distance. In "
+            f"the paper that of the minimal methods is {near_there:.0f} % and {far_there:.0f} %: "
+            f"it {trend[lower(far_there, near_there, 0.02)]} it.",
         ],
         claims,
     )
