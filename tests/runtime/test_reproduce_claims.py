@@ -8,7 +8,7 @@ from typing import Any
 import epigauge as eg
 import numpy as np
 import pytest
-from epigauge.reproduce import essential, gauge_sweeps, successes, sweeps
+from epigauge.reproduce import essential, gauge_runs, successes, sweeps
 from epigauge.reproduce.common import METHODS
 from epigauge.reproduce.gauge_runs import LABELS, GaugeStudy
 from epigauge.reproduce.report import Claim, lower
@@ -54,7 +54,7 @@ def test_table3_restarts_each_method_where_the_others_ended() -> None:
 )
 def test_errors_that_differ_by_a_few_millionths_are_not_the_same(above: float, same: bool) -> None:
     error = np.array([[[1.0, 2.0]], [[1.0 + above, 2.0 * (1.0 + above)]]])
-    found = gauge_sweeps.lowest(error)
+    found = gauge_runs.lowest(error)
     assert found[0].all()
     assert (found[1] == same).all()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from epigauge.reproduce import gauge_invariance, gauge_sweeps, hard_starts
+from epigauge.reproduce import gauge_invariance, gauge_sweeps, gauge_variations, hard_starts
 from epigauge.reproduce.gauge_runs import GaugeStudy
 from epigauge.reproduce.report import Section
 from epigauge.reproduce.run import Paper
@@ -18,6 +18,7 @@ EXPERIMENTS: dict[str, Callable[[GaugeStudy], Section]] = {
     "table2": gauge_sweeps.hotel,
     "bases": gauge_invariance.bases,
     "defects": gauge_invariance.defects,
+    "variations": gauge_variations.variations,
     "starts": hard_starts.starts,
 }
 
@@ -29,14 +30,14 @@ def introduction(study: GaugeStudy) -> list[str]:
         'dependent damping", ICCV 2003, section 7, with the program that ships with this package: '
         f"epigauge reproduce b2003 --trials {study.trials} --seed {study.seed}. "
         "LEVENBERG and MARQUARDT leave everything free and damp by lambda I and lambda diag(N); "
-        "KANATANI, which the paper calls similar to FREE, is damped by lambda I here instead of a "
-        "pseudo-inverse. Step 3 of Table 1, a projection onto a global gauge, is recommended there "
-        "and has a row of its own; without it rounding and the basis show. COVARIANT is ours: "
-        "covariant damping and points re-triangulated (embedded) after each step.",
-        "Not repeated: the paper's unpublished variations of the numbers of points and cameras, of "
-        "the baseline and the visibility (section 7.1), and the office sequence of Table 2, which "
-        "is not public. Iterations and costs repeat on a processor; on another one sums round "
-        "differently, and in weak geometry that may change a count by a step or more.",
+        "KANATANI, which the paper calls similar to FREE, is damped by lambda I here; with FREE's "
+        "pseudo-inverse it has a row of its own, as have MCLAUCHLAN without its constraints and "
+        "Table 1 with its step 3, a projection onto a global gauge, which the paper recommends; "
+        "without it rounding and the basis show. COVARIANT is ours: covariant damping and points "
+        "re-triangulated (embedded) after each step.",
+        "Not repeated: the office sequence of Table 2, which is not public. "
+        "Iterations and costs repeat on a processor; on another one sums round differently, and in "
+        "weak geometry that may change a count by a step or more.",
     ]
 
 

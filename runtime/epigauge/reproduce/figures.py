@@ -30,6 +30,8 @@ STYLES: dict[str, dict[str, Any]] = {
     "FAUGERAS": {"color": "#e377c2", "marker": "h", "ls": "--"},
     "MCLAUCHLAN": {"color": "#7b2d8b", "marker": "P", "ls": "-"},
     "KANATANI": {"color": "#17becf", "marker": "d", "ls": "-."},
+    "MCLAUCHLAN, without constraints": {"color": "#7b2d8b", "marker": "1", "ls": ":"},
+    "KANATANI, pseudo-inverse": {"color": "#17becf", "marker": "2", "ls": ":"},
     "GAUGE_INVARIANT": {"color": "#c1121f", "marker": "o", "ls": "-"},
     "GAUGE_INVARIANT, rank one": {"color": "#c1121f", "marker": "x", "ls": ":"},
     "GAUGE_INVARIANT, with step 3": {"color": "#c1121f", "marker": "s", "ls": "--"},

@@ -12,10 +12,9 @@ from epigauge.bundle.run import REFINEMENT, bundle_problem
 from epigauge.cameras import camera_model
 from epigauge.multi_view.adjust import BundleResult
 from epigauge.multi_view.frame import Frame
-from epigauge.multi_view.gauge import normalized
 from epigauge.multi_view.initialize import initialize
 from epigauge.multi_view.tracks import Reconstruction, Tracks
-from epigauge.reproduce.gauge_runs import LABELS, GaugeStudy, moved, random_transformation
+from epigauge.reproduce.gauge_runs import LABELS, GaugeStudy, perturbed
 from epigauge.reproduce.report import Claim, Section, Table
 
 __all__ = ["starts"]
@@ -114,7 +113,7 @@ def _by_method(
     kinds: list[Sequence[Reconstruction]] = []
     for share in _SHARES:
         random = np.random.default_rng(study.seed)
-        kinds.append([_perturbed(random, frame, start, share) for _ in range(study.trials)])
+        kinds.append([perturbed(random, frame, start, share, 10.0) for _ in range(study.trials)])
     random = np.random.default_rng(study.seed)
     kinds.append([_random_reconstruction(random, tracks, frame) for _ in range(study.trials)])
     kinds.append(factored)
@@ -148,18 +147,6 @@ def _successes(results: Sequence[BundleResult], best: float) -> float:
 def _factored(study: GaugeStudy, tracks: Tracks) -> list[Reconstruction]:
     seeds = range(study.seed, study.seed + study.trials)
     return [initialize(tracks, method="factorization", seed=seed) for seed in seeds]
-
-
-def _perturbed(
-    random: np.random.Generator, frame: Frame, start: Reconstruction, share: float
-) -> Reconstruction:
-    """Return a reconstruction with errors of a share of each norm, in a random basis."""
-    P, Q = frame.cameras_in(start.P), start.Q
-    P, Q = normalized().transformation(P, Q).apply(P, Q)
-    P = P + share * random.normal(size=P.shape) / np.sqrt(12.0)
-    Q = Q + share * random.normal(size=Q.shape) / 2.0
-    there = random_transformation(random, 10.0, len(P), len(Q))
-    return moved(Reconstruction(frame.cameras_out(P), Q), there)
 
 
 def _random_reconstruction(
