@@ -15,8 +15,12 @@ from epigauge import _library, kernels
 TESTS = Path(__file__).parent
 DEFAULT = (
     *("generated/test_backends.py", "generated/test_foot_points.py", "generated/test_table.py"),
-    *("runtime/test_two_view_native.py", "runtime/test_batch.py", "runtime/test_many_fused.py"),
-    *("generated/test_joint.py", "runtime/test_two_view_fused.py"),
+    *(
+        "runtime/test_two_view_native.py",
+        "runtime/test_batch.py",
+        "runtime/test_native_linearizer.py",
+    ),
+    *("runtime/test_bundle_native.py", "generated/test_joint.py", "runtime/test_two_view_fused.py"),
 )
 
 
@@ -30,7 +34,7 @@ def main() -> int:
     for name in _library.usable():
         print(f"\n## {name}\n", flush=True)
         environment = os.environ | {_library.CHOICE: name}
-        command = [sys.executable, "-m", "pytest", "-m", "not slow", *arguments]
+        command = [sys.executable, "-m", "pytest", "-n", "auto", "-m", "not slow", *arguments]
         failed |= subprocess.run(command, env=environment, check=False).returncode != 0
     return int(failed)
 

@@ -36,7 +36,7 @@ def depths(r: eg.FundamentalResult, x1: Array, x2: Array, K: Array) -> Array:
     """Depths in both cameras by least squares, shape (m, 2): another way than that of the code."""
     rays = [np.column_stack([x, np.ones(len(x))]) @ np.linalg.inv(K).T for x in (x1, x2)]
     systems = np.stack([rays[0] @ r.R.T, -rays[1]], axis=2)
-    return np.stack([np.linalg.lstsq(A, -r.t)[0] for A in systems])
+    return np.stack([np.linalg.lstsq(A, -r.t, rcond=None)[0] for A in systems])
 
 
 def plane(seed: int, m: int = 40, slant: float = 0.0) -> tuple[Array, Array]:
