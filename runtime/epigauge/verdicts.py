@@ -100,8 +100,8 @@ FLAGS = {
         "compare them (result.minima), or add matches that tell them apart",
     ),
     "weak geometry": Flag(
-        "the standard deviation of the result exceeds a tenth of its size: first-order covariances "
-        "are not to be relied on",
+        "the standard deviation of the result exceeds a tenth of its size, or the noise hides the "
+        "relief of the scene: first-order covariances are not to be relied on",
         "use more matches, spread over both images and in depth, or a longer baseline",
     ),
     "near-affine": Flag(

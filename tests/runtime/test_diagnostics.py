@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from epigauge.two_view.diagnostics import _variance_ratio_99, fit_homography
 from epigauge.verdicts import FLAGS
-from two_views import Array, homogeneous, inliers
+from two_views import Array, algebraic, homogeneous, inliers
 
 FOCAL = 1000.0
 CENTRE = np.array([512.0, 384.0])
@@ -91,6 +91,21 @@ class TestSimulated:
             share.append(np.mean(["weak geometry" in raised for raised in flags]))
         assert share[0] == 0
         assert share[1] >= 0.3
+
+    @pytest.mark.parametrize("distance", [12.0, 20.0])
+    def test_noise_that_hides_relief_is_weak_geometry_and_no_plane(self, distance) -> None:
+        # Points within 80 and 50 px, a noise of 1.4: the relief of a cube is below it.
+        spoiling = {"planar scene", "still camera", "pure rotation", "no common geometry"}
+        for seed in range(40, 46):
+            view = eg.two_view_scene(distance, seed=seed)
+            result = eg.refine_fundamental(view.x1, view.x2)
+            assert spoiling.isdisjoint(result.flags)
+            assert result.success
+            if distance == 20.0:
+                assert "weak geometry" in result.flags
+            fresh = eg.two_view_scene(distance, seed=seed + 1000, noise_px=0.0, n_points=200)
+            # It does predict other points of the scene, to less than the noise.
+            assert np.median(np.abs(algebraic(result.F, fresh.x1, fresh.x2))) < 1.0
 
     def test_flags_do_not_depend_on_the_noise_that_the_caller_believes(self) -> None:
         view = eg.two_view_scene(8.0, seed=0)

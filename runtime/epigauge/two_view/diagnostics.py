@@ -274,15 +274,18 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     With S the weighted sum of squared distances to F, S_H to a homography, S_A to an affine F, S_I
     to no motion at all, and the noise s^2 = S / (n - p), the flags say
 
-    - no common geometry: fewer than `chance.SIGNIFICANT` says of all geometries would agree so well
-      with wrong matches;
-    - gross errors: the geometry of highest likelihood under a mixture of right and wrong matches
-      leaves some far off, and the variance of those near it is less than half of s^2;
+    - no common geometry: more geometries than `chance.SIGNIFICANT` says would agree so well with
+      wrong matches, with F and with the best other geometry;
+    - gross errors: the geometry of highest likelihood under a mixture of right and wrong matches is
+      no chance, leaves some far off, and the variance of those near it is less than half of s^2;
     - planar scene: ``S_H / (2 n - 8) <= max(1.5, F99) s^2``, with F99 the 99 % quantile of the
       ratio of two such variances. The bound 1.5 is that of the geometric AIC [1]_ for many matches,
       ``S_H + 2 (2 n + 8) s^2 <= S + 2 (3 n + p) s^2``; with few matches an F fits a plane better
-      than its 7 parameters promise, since its epipoles are free to move among the points. Matches
-      off the plane are left out where they are no more than agree by chance [2]_;
+      than its 7 parameters promise, since its epipoles are free to move among the points. A relief
+      of ``sqrt(2) s`` RMS shows under that bound. Where this is more than one per cent of the range
+      of the coordinates, the noise would hide the relief of any scene, and the flag is "weak
+      geometry" instead. Matches off the plane are left out where they are no more than agree by
+      chance [2]_;
     - nearly planar: of the matches that agree with F at most a tenth, and fewer than 30, are more
       than 8 s from the homography that most are on, the others by one per cent of the range at
       most, RMS; at most a quarter where all are within half a per cent, RMS;
@@ -293,7 +296,8 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     - not oriented; of calibrated cameras behind the cameras: some points farther from being in
       front of both than three standard deviations;
     - near-affine: ``S_A - S <= 11.34 s^2``;
-    - weak geometry: ``deviation > 0.1``; few matches: ``n - p < 8``.
+    - weak geometry: ``deviation > 0.1``, or a homography explains the matches and the noise hides
+      relief; few matches: ``n - p < 8``.
 
     References
     ----------
@@ -312,13 +316,18 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     }
     judged = found
     if not found.searched and _is_suspicious(found):
-        judged = _agreeing(found)
-        raised["gross errors"] = judged.searched and _is_inflated(found, judged)
+        agreeing = _agreeing(found)
+        if agreeing.searched and _is_common(agreeing):
+            judged = agreeing
+            raised["gross errors"] = _is_inflated(found, judged)
     few = raised["few matches"] and not found.searched  # too few to show anything: that is told
-    if judged.searched and not few and not _is_common(judged):
-        raised |= {"no common geometry": True, "gross errors": False}
+    wide = found.noise > _SUSPICIOUS * RANGE
+    doubtful = judged.searched or (wide and not few)
+    if doubtful and not _is_common(judged):
+        raised["no common geometry"] = True
     else:
-        raised |= _plane(judged)
+        for name, is_raised in _plane(judged).items():
+            raised[name] = is_raised or raised.get(name, False)
     return ordered(name for name, is_raised in raised.items() if is_raised)
 
 
@@ -367,7 +376,7 @@ def _is_inflated(found: Evidence, judged: Evidence) -> bool:
 
 def _is_common(found: Evidence) -> bool:
     """Tell whether more matches agree with F than wrong ones would by chance."""
-    limit = min(found.limit, CEILING * RANGE)
+    limit = min(found.limit, CEILING * RANGE) if found.searched else found.limit
     near = found.squared <= limit**2
     m, agreeing = len(found.inlier), int(np.count_nonzero(near))
     if not agreeing:
@@ -393,7 +402,8 @@ def _plane(found: Evidence) -> dict[str, bool]:
     H, squares, N_H = fit_homography(q1, q2, weights)
     S, S_H = float(weights @ found.squared[on]), float(weights @ squares)
     ratio = max(_AIC_RATIO, _variance_ratio_99(max(2 * n - 8, 1), max(n - p, 4)))
-    planar = (2 * n - 8) * ratio * noise2 >= S_H
+    explained = (2 * n - 8) * ratio * noise2 >= S_H
+    planar = explained and 2.0 * noise2 <= (_RELIEF * RANGE) ** 2
     more = _displacement(found, q1, q2, weights) - S_H
     if found.from_rays is None:
         turned = _may_be_rotation(found, H, N_H)
@@ -406,6 +416,7 @@ def _plane(found: Evidence) -> dict[str, bool]:
         "planar scene": planar and not still,
         "nearly planar": nearly and not planar,
         "pure rotation": planar and not still and turned,
+        "weak geometry": explained and not planar,
         "near-affine": not still and _affine_cost(q1, q2, weights) <= S + _AFFINE * noise2,
     }
 
