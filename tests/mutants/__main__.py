@@ -1,28 +1,37 @@
 """`python tests/mutants planted|random`: plant faults one at a time, and say which no test notices.
 
-Works on a copy of the checkout (build/mutants). Results are appended to a JSON-lines file; faults
-that it holds already are not planted again, so that a long run can be done in pieces.
+Works on a copy of the checkout (build/mutants). Only tests that run the changed line are run, the
+quickest first. Results are appended to a file of JSON lines; faults that it holds already are not
+planted again, so that a long run can be done in pieces.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import json
+import re
 import sys
 import time
-import tomllib
-from dataclasses import replace
-from fnmatch import fnmatch
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from faults import HERE, Fault, files_tests, planted_faults
+from faults import Fault, area, areas, planted_faults
 from operators import drawn
-from scratch import PASSED, ROOT, CannotBuild, Scratch
+from reach import Reach, recorded
+from report import printed
+from runs import PASSED, first_failure, prepare
+from scratch import ROOT, CannotBuild, Scratch
 
-#: Longest run of the tests of an area with a fault; an endless loop is noticed.
-_SECONDS = 300.0
+#: Longest run of the tests of a stage with a fault; an endless loop is noticed.
+_SECONDS = 150.0
+
+#: Tests of the first two stages take together at most so many seconds without the fault.
+_STAGES = 2.0, 15.0
+
+#: A test of a file that the area does not name is run as if it took so many times as long.
+_FAR = 5.0
 
 
 def main() -> int:
@@ -31,115 +40,169 @@ def main() -> int:
     parser.add_argument("what", choices=["planted", "random", "report"])
     parser.add_argument("--only", nargs="*", help="names of planted faults")
     parser.add_argument("--area", nargs="*", help="areas of areas.toml (random)")
-    parser.add_argument("--count", type=int, default=200, help="random faults to draw")
+    parser.add_argument("--count", type=int, default=30, help="random faults of each area")
+    parser.add_argument("--lines", default="", help="random faults in lines with this pattern only")
+    parser.add_argument("--near", action="store_true", help="only tests that the areas name")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--again", action="store_true", help="plant survivors once more")
     parser.add_argument("--scratch", type=Path, default=ROOT / "build" / "mutants")
     parser.add_argument("--results", type=Path, default=None, help="JSON lines")
     options = parser.parse_args()
-    results = options.results or options.scratch / f"{options.what}.jsonl"
+    options.scratch.mkdir(parents=True, exist_ok=True)
     if options.what == "report":
-        return _report([json.loads(line) for line in results.read_text().splitlines()])
+        files = [options.results] if options.results else sorted(options.scratch.glob("*.jsonl"))
+        return max(printed(f"## {path.stem}", list(_done(path).values())) for path in files)
+    results = options.results or options.scratch / f"{options.what}.jsonl"
+    prepare()
     scratch = Scratch.made(options.scratch)
     if options.what == "planted":
-        found = list(planted_faults(scratch.path))
-        for sentence in (entry for entry in found if isinstance(entry, str)):
-            print(sentence)
-        faults = [fault for fault in found if isinstance(fault, Fault)]
-        faults = [fault for fault in faults if not options.only or fault.name in options.only]
+        faults = _planted(scratch.path, options.only)
     else:
-        faults = _random(scratch.path, options.area, options.count, options.seed)
-    done = _done(results) if options.what == "random" else {}
-    if options.again:
-        done = {key: row for key, row in done.items() if row["verdict"] != "survived"}
+        faults = _random(scratch.path, options)
+    of = {str(area(fault.file)["name"]) for fault in faults}
+    reach = recorded(scratch, _test_files(scratch.path, of if options.near else None))
+    for name in reach.broken:
+        print(f"left out, since it fails without any fault: {name}")
+    done = _done(results)
+    if options.again or options.only:
+        done = {key: row for key, row in done.items() if row["verdict"] == "killed"}
     rows = []
-    sound: dict[str, bool] = {}
     for number, fault in enumerate(faults, 1):
-        row = done.get(_identity(scratch.path, fault))
+        text = (scratch.path / fault.file).read_text()
+        row = done.get((fault.file, *fault.lines(text)))
         if row is None:
-            tests = _sound(scratch, fault.tests, sound)
-            row = _tried(scratch, replace(fault, tests=tests))
-        rows.append(row)
-        if _identity(scratch.path, fault) not in done:
+            row = _tried(scratch, fault, text, reach)
             with results.open("a") as file:
                 file.write(json.dumps(row) + "\n")
+        rows.append(row)
         print(
-            f"{number}/{len(faults)} {row['verdict']:9} {row['seconds']:5.1f} s {row['name']} "
-            f"{row['file']}:{row['line']} {row['what']} [{row['detail'][-90:]}]",
+            f"{number}/{len(faults)} {row['verdict']:9} {row['seconds']:5.1f} s {fault.name} "
+            f"{fault.file}:{row['line']} {fault.what} [{str(row['detail'])[-90:]}]",
             flush=True,
         )
-    return _report(rows)
+    return printed(f"## {options.what}", rows)
 
 
-def _random(root: Path, areas: list[str] | None, count: int, seed: int) -> list[Fault]:
-    known = tomllib.loads((HERE / "areas.toml").read_text())
-    chosen = [a for a in known["area"] if (a["name"] in areas if areas else a.get("random", True))]
-    files = {}
-    for path in sorted((root / "runtime").rglob("*.*")):
-        name = path.relative_to(root).as_posix()
-        first = next((a for a in known["area"] if any(fnmatch(name, p) for p in a["files"])), None)
-        if first in chosen and path.suffix in (".py", ".c", ".h") and "sitecustomize" not in name:
-            files[name] = path.read_text()
-    return [
-        Fault(
-            f"R{seed}.{k}",
-            change.kind,
-            name,
-            change.begin,
-            change.end,
-            change.new,
-            files_tests(root, name, ()),
-        )
-        for k, (name, change) in enumerate(drawn(files, count, seed))
+def _planted(root: Path, only: list[str] | None) -> list[Fault]:
+    found = list(planted_faults(root))
+    for sentence in (entry for entry in found if isinstance(entry, str)):
+        print(sentence)
+    faults = [fault for fault in found if isinstance(fault, Fault)]
+    return [fault for fault in faults if not only or fault.name in only]
+
+
+def _random(root: Path, options: argparse.Namespace) -> list[Fault]:
+    paths = sorted((root / "runtime").rglob("*.*"))
+    names = [
+        path.relative_to(root).as_posix() for path in paths if path.suffix in (".py", ".c", ".h")
     ]
+    faults = []
+    for entry in areas():
+        if entry["name"] in options.area if options.area else entry.get("random", True):
+            files = {
+                name: (root / name).read_text()
+                for name in names
+                if name.split("/")[1] in ("epigauge", "c") and _is_of(name, entry["name"])
+            }
+            for k, (name, change) in enumerate(
+                drawn(files, options.count, options.seed, re.compile(options.lines))
+            ):
+                old = files[name][change.begin : change.end]
+                what = f"{change.kind}: {old!r} -> {change.new!r}"
+                label = f"R{options.seed}.{k}"
+                faults.append(Fault(label, what, name, change.begin, change.end, change.new))
+    return faults
 
 
-def _sound(scratch: Scratch, tests: list[str], known: dict[str, bool]) -> list[str]:
-    """Return the tests that pass without any fault; the others would notice everything."""
-    for test in tests:
-        if test not in known:
-            verdict, detail = scratch.test([test], 4.0 * _SECONDS)
-            known[test] = verdict == PASSED
-            if not known[test]:
-                print(f"left out, since it fails without any fault: {detail}", flush=True)
-    return [test for test in tests if known[test]]
-
-
-def _tried(scratch: Scratch, fault: Fault) -> dict[str, object]:
-    path = scratch.path / fault.file
-    text = path.read_text()
-    begun = time.perf_counter()
-    row = _identity_row(text, fault)
+def _is_of(file: str, name: str) -> bool:
     try:
-        path.write_text(fault.planted(text))
-        scratch.remake(fault.file)
-        verdict, detail = scratch.test(fault.tests, _SECONDS)
+        return bool(area(file)["name"] == name)
+    except ValueError:
+        return False
+
+
+def _test_files(root: Path, of: set[str] | None) -> list[str]:
+    """Return the files of tests that some areas name, or all."""
+    chosen = [entry for entry in areas() if of is None or entry["name"] in of]
+    named = {f"tests/{test}" for entry in chosen for test in entry["tests"]}
+    return sorted(name for name in named if (root / name).is_file())
+
+
+def _tried(scratch: Scratch, fault: Fault, text: str, reach: Reach) -> dict[str, object]:
+    begun = time.perf_counter()
+    old, new = fault.lines(text)
+    row = {
+        "name": fault.name,
+        "what": fault.what,
+        "file": fault.file,
+        "line": text.count("\n", 0, fault.begin) + 1,
+        "old": old,
+        "new": new,
+    }
+    try:
+        scratch.write(fault.file, fault.planted(text))
+        verdict, detail = PASSED, ""
+        stages = _stages(scratch.path, fault, text, reach)
+        for tests in stages:
+            if verdict == PASSED:
+                verdict, detail = first_failure(scratch, tests, _SECONDS)
+        if verdict == PASSED:
+            detail = f"{sum(map(len, stages))} tests"
         row |= {"verdict": "survived" if verdict == PASSED else "killed", "detail": detail}
     except CannotBuild as error:
         row |= {"verdict": "invalid", "detail": str(error)}
     finally:
-        path.write_text(text)
         scratch.restore(fault.file)
     return row | {"seconds": round(time.perf_counter() - begun, 1)}
 
 
-def _identity_row(text: str, fault: Fault) -> dict[str, object]:
-    old = text[fault.begin : fault.end]
-    first = text.rfind("\n", 0, fault.begin) + 1
-    last = text.find("\n", fault.end)
-    return {
-        "name": fault.name,
-        "what": f"{fault.what}: {old!r} -> {fault.new!r}",
-        "file": fault.file,
-        "line": text.count("\n", 0, fault.begin) + 1,
-        "old": text[first:last].strip(),
-        "new": (text[first : fault.begin] + fault.new + text[fault.end : last]).strip(),
-    }
+def _stages(root: Path, fault: Fault, text: str, reach: Reach) -> list[list[str]]:
+    """Return the tests for a fault in the order in which they are run."""
+    here = area(fault.file)
+    tests: set[str] = set()
+    for module in here.get("through", [fault.file]):
+        tests |= reach.of_file(module)
+    if fault.file.endswith(".py") and (lines := _statement(fault, text)):
+        tests = reach.of_lines(fault.file, lines)
+    whole = [f"tests/{name}" for name in here["tests"]]
+    if fault.file.startswith("derive/"):
+        return [[name] for name in whole if (root / name).exists()]
+
+    def price(test: str) -> float:
+        return reach.seconds[test] * (1.0 if test.split("::")[0] in whole else _FAR)
+
+    stages: list[list[str]] = [[], [], []]
+    total = 0.0
+    for test in sorted(tests, key=price):
+        total += reach.seconds[test]
+        stages[sum(total > limit for limit in _STAGES)].append(test)
+    return [sorted(stage) for stage in stages if stage]
 
 
-def _identity(root: Path, fault: Fault) -> tuple[object, ...]:
-    row = _identity_row((root / fault.file).read_text(), fault)
-    return row["file"], row["old"], row["new"]
+def _statement(fault: Fault, text: str) -> list[str]:
+    """Return the lines of the statement that a fault stands in; none at the level of a module.
+
+    Of a compound statement (if, for, with) only its heading counts; a default of an argument runs
+    when a module is imported.
+    """
+    first = text.count("\n", 0, fault.begin) + 1
+    last = text.count("\n", 0, fault.end) + 1
+    found: list[str] = []
+    lines = text.splitlines()
+
+    def visit(node: ast.AST, inside: bool) -> None:
+        nonlocal found
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.stmt):
+                body = getattr(child, "body", None)
+                end = body[0].lineno - 1 if body else child.end_lineno
+                if inside and child.lineno <= first and last <= max(end, child.lineno):
+                    function = isinstance(child, ast.FunctionDef | ast.ClassDef)
+                    found = [] if function else lines[child.lineno - 1 : max(end, child.lineno)]
+            visit(child, inside or isinstance(node, ast.FunctionDef))
+
+    visit(ast.parse(text), False)
+    return found
 
 
 def _done(results: Path) -> dict[tuple[object, ...], dict[str, object]]:
@@ -147,39 +210,6 @@ def _done(results: Path) -> dict[tuple[object, ...], dict[str, object]]:
         return {}
     rows = [json.loads(line) for line in results.read_text().splitlines()]
     return {(row["file"], row["old"], row["new"]): row for row in rows}
-
-
-def _report(rows: list[dict[str, object]]) -> int:
-    """Print counts by area, and the survivors; return 1 where one is not equivalent."""
-    areas = tomllib.loads((HERE / "areas.toml").read_text())["area"]
-    equivalent = {
-        (entry["old"], entry["new"]): entry["reason"]
-        for entry in tomllib.loads((HERE / "equivalent.toml").read_text()).get("equivalent", [])
-    }
-    table: dict[str, list[int]] = {}
-    survivors = []
-    for row in rows:
-        name = next(
-            a["name"] for a in areas if any(fnmatch(str(row["file"]), p) for p in a["files"])
-        )
-        counts = table.setdefault(name, [0, 0, 0, 0])
-        if row["verdict"] == "invalid":
-            continue
-        counts[0] += 1
-        counts[1] += row["verdict"] == "killed"
-        if row["verdict"] == "survived":
-            same = (row["old"], row["new"]) in equivalent
-            counts[2 if same else 3] += 1
-            survivors += [] if same else [row]
-    table["all"] = (
-        [sum(column) for column in zip(*table.values(), strict=True)] if table else [0] * 4
-    )
-    print("\n| area | faults | noticed | equivalent | survived |\n|---|---:|---:|---:|---:|")
-    for name, counts in table.items():
-        print(f"| {name} | " + " | ".join(map(str, counts)) + " |")
-    for row in survivors:
-        print(f"\n{row['name']} {row['file']}:{row['line']}\n- {row['old']}\n+ {row['new']}")
-    return int(bool(survivors))
 
 
 if __name__ == "__main__":

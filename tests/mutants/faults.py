@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatch
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).parent
 
@@ -26,8 +28,6 @@ class Fault:
         The characters replaced.
     new : str
         By what.
-    tests : list of str
-        Tests of the area, the likeliest to notice it first.
     """
 
     name: str
@@ -36,11 +36,32 @@ class Fault:
     begin: int
     end: int
     new: str
-    tests: list[str]
 
     def planted(self, text: str) -> str:
         """Return the file's text with the fault."""
         return text[: self.begin] + self.new + text[self.end :]
+
+    def lines(self, text: str) -> tuple[str, str]:
+        """Return the lines it stands in as they are and as they become, without indentation."""
+        first = text.rfind("\n", 0, self.begin) + 1
+        last = text.find("\n", self.end)
+        new = text[first : self.begin] + self.new + text[self.end : last]
+        return text[first:last].strip(), new.strip()
+
+
+@cache
+def areas() -> list[dict[str, Any]]:
+    """Return the areas of areas.toml."""
+    found: list[dict[str, Any]] = tomllib.loads((HERE / "areas.toml").read_text())["area"]
+    return found
+
+
+def area(file: str) -> dict[str, Any]:
+    """Return the area that a source belongs to."""
+    for entry in areas():
+        if any(fnmatch(file, pattern) for pattern in entry["files"]):
+            return entry
+    raise ValueError(f"no area of areas.toml holds {file}")
 
 
 def planted_faults(root: Path) -> Iterator[Fault | str]:
@@ -53,15 +74,7 @@ def planted_faults(root: Path) -> Iterator[Fault | str]:
             continue
         (file, begin, end, indent) = found[0]
         new = _indented(entry["new"], indent)
-        yield Fault(
-            entry["name"],
-            entry["what"],
-            file,
-            begin,
-            end,
-            new,
-            files_tests(root, file, entry.get("tests", ())),
-        )
+        yield Fault(entry["name"], entry["what"], file, begin, end, new)
 
 
 def _places(root: Path, file: str, old: str) -> list[tuple[str, int, int, str]]:
@@ -89,16 +102,3 @@ def _indented(new: str, indent: str) -> str:
     own = len(lines[0]) - len(lines[0].lstrip())
     moved = [lines[0].strip(), *(indent + line[own:] for line in lines[1:])]
     return "\n".join(line.rstrip() for line in moved)
-
-
-def files_tests(root: Path, file: str, first: Sequence[str]) -> list[str]:
-    """Return the tests of a file's area that there are, after some that come first."""
-    named = list(first)
-    areas = tomllib.loads((HERE / "areas.toml").read_text())["area"]
-    for area in areas:
-        if any(fnmatch(file, pattern) for pattern in area["files"]):
-            named += [test for test in area["tests"] if test not in named]
-            break
-    else:
-        raise ValueError(f"no area of areas.toml holds {file}")
-    return [test for test in named if (root / test.split("::")[0]).is_file()]

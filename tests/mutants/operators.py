@@ -49,11 +49,23 @@ def changes(name: str, text: str) -> list[Change]:
     return sorted(found, key=lambda change: (change.begin, change.end, change.new))
 
 
-def drawn(files: dict[str, str], count: int, seed: int) -> list[tuple[str, Change]]:
-    """Draw changes without repetition: a file by its number of changes, then one of them."""
-    every = [(name, change) for name, text in files.items() for change in changes(name, text)]
+def drawn(
+    files: dict[str, str], count: int, seed: int, lines: re.Pattern[str]
+) -> list[tuple[str, Change]]:
+    """Draw changes without repetition, of lines that hold a pattern, each as likely as the next."""
+    every = [
+        (name, change)
+        for name, text in files.items()
+        for change in changes(name, text)
+        if lines.search(_line(text, change.begin))
+    ]
     random.Random(seed).shuffle(every)
     return every[:count]
+
+
+def _line(text: str, place: int) -> str:
+    end = text.find("\n", place)
+    return text[text.rfind("\n", 0, place) + 1 : end if end >= 0 else None]
 
 
 # ---------------------------------------------------------------- Python

@@ -1,17 +1,21 @@
-"""A copy of the checkout in which faults are planted, and in which the tests run.
+"""A copy of the checkout in which faults are planted, with the variant of the C library it loads.
 
-Python is imported from the copy (a `sitecustomize` takes editable installs out of the way), and the
-C library is compiled there, one variant, file by file.
+Python is imported from the copy (a `sitecustomize` takes editable installs out of the way). After a
+fault in C only the files that it changes are compiled, with little optimisation.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
-import shutil
-import signal
+import re
+import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.util import cache_from_source
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -25,9 +29,6 @@ sys.meta_path[:] = [
     if "editable" not in f"{type(finder).__module__} {type(finder).__name__}".lower()
 ]
 """
-
-#: What a run of the tests can say.
-PASSED, FAILED, SLOW = "passed", "failed", "too slow"
 
 
 class CannotBuild(Exception):
@@ -48,7 +49,7 @@ class Scratch:
 
     @staticmethod
     def made(path: Path) -> Scratch:
-        """Copy the checkout and build its C library; a library there already is kept up to date."""
+        """Copy the checkout and build its C library; objects there already are kept up to date."""
         scratch = Scratch(path)
         for name in FOLDERS:
             _mirror(ROOT / name, path / name)
@@ -56,100 +57,102 @@ class Scratch:
             _refresh(ROOT / name, path / name)
         (path / "runtime" / "sitecustomize.py").write_text(_SITE)
         build = path / "build"
-        if not (build / "CMakeCache.txt").exists():
-            launcher = shutil.which("ccache")
-            options = [f"-DCMAKE_C_COMPILER_LAUNCHER={launcher}"] if launcher else []
-            _checked(["cmake", "-S", path, "-B", build, "-DCMAKE_BUILD_TYPE=Release", *options])
-        scratch.build()
+        _checked(["cmake", "-S", path, "-B", build, "-DCMAKE_EXPORT_COMPILE_COMMANDS=ON"])
+        scratch._link()
+        # Without it the library does not ask whether it was built from the sources beside it.
+        (path / "CMakeLists.txt").unlink()
         probe = "import epigauge, epigauge_generated as g; print(epigauge.__file__, g.__file__)"
-        environment = scratch.environment()
         command = [sys.executable, "-c", probe]
+        environment = os.environ | scratch.environment()
         done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
         for name in done.stdout.split():
             if not Path(name).is_relative_to(path):
                 raise RuntimeError(f"the tests would import {name}, not the copy in {path}")
         return scratch
 
-    def build(self) -> None:
-        """Compile what has changed, and put the library where the modules look for it."""
-        build = self.path / "build"
-        _checked(["cmake", "--build", build, "--target", "epigauge_kernels"], "the compiler")
-        for library in build.glob("libepigauge_kernels.*"):
-            target = self.path / "generated" / "epigauge_generated" / "c_backend" / library.name
-            shutil.copyfile(library, target.with_name("new"))
-            target.with_name("new").replace(target)
-
-    def remake(self, name: str) -> None:
-        """Bring up to date what a changed file is the source of."""
+    def write(self, name: str, text: str) -> None:
+        """Write a source so that no cache takes it for what it was; bring up what it is for."""
+        path = self.path / name
+        path.write_text(text)
+        Path(cache_from_source(str(path))).unlink(missing_ok=True)
         if name.startswith("derive/"):
             generated = self.path / "generated"
-            libraries = {path: path.read_bytes() for path in generated.rglob("lib*")}
             command = [sys.executable, "-m", "epigauge_derive", "--output", generated]
-            _checked(command, "the derivation", self.environment())
-            for path, content in libraries.items():
-                path.write_bytes(content)
+            keep = {path: path.read_bytes() for path in generated.rglob("*.so")}
+            _checked(command, "the derivation", os.environ | self.environment())
+            for library, content in keep.items():
+                library.write_bytes(content)
         if name.startswith("derive/") or name.endswith((".c", ".h")):
-            self.build()
+            self._link()
 
     def restore(self, name: str) -> None:
-        """Undo `remake`, the file being as it was."""
+        """Undo `write`."""
+        text = (ROOT / name).read_text()
         if name.startswith("derive/"):
+            _refresh(ROOT / name, self.path / name)
             _mirror(ROOT / "generated", self.path / "generated")
+        elif name.endswith((".c", ".h")):
+            _refresh(ROOT / name, self.path / name)
+        else:
+            self.write(name, text)
         if name.startswith("derive/") or name.endswith((".c", ".h")):
-            self.build()
+            self._link()
 
-    def test(self, tests: list[str], seconds: float) -> tuple[str, str]:
-        """Run tests until the first failure: the first file, two more, then the rest.
+    def _link(self) -> None:
+        """Compile what has changed since it was compiled last, with little optimisation; link."""
+        build = self.path / "build"
+        objects = []
+        for command, source in self._commands():
+            digest = hashlib.sha256()
+            for path in _included(source, self.path):
+                digest.update(path.read_bytes())
+            made = build / f"{source.stem}-{digest.hexdigest()[:16]}.o"
+            if not made.exists():
+                _checked([*command, "-o", made, "-c", source], "the compiler")
+            objects.append(made)
+        folder = self.path / "generated" / "epigauge_generated" / "c_backend"
+        # A new file each time: the one that is there may be in use.
+        _checked([command[0], "-shared", "-o", folder / "new", *objects, "-lm"], "the linker")
+        (folder / "new").replace(folder / "libepigauge_kernels.so")
 
-        Files are collected before the first test runs, which takes longer than most faults live.
-
-        Returns
-        -------
-        verdict : {"passed", "failed", "too slow"}
-            A fault that is not noticed has passed.
-        detail : str
-            Name of the test that failed.
-        """
-        verdict = PASSED, ""
-        for stage in (tests[:1], tests[1:3], tests[3:]):
-            if stage and verdict[0] == PASSED:
-                verdict = self._run(stage, seconds)
-        return verdict
-
-    def _run(self, tests: list[str], seconds: float) -> tuple[str, str]:
-        options = ["-q", "-x", "-p", "no:cacheprovider", "--tb=no", "-m", "not slow"]
-        command = [sys.executable, "-m", "pytest", *options, *tests]
-        with subprocess.Popen(
-            command,
-            cwd=self.path,
-            env=self.environment(),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=True,
-        ) as process:
-            try:
-                text, _ = process.communicate(timeout=seconds)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.communicate()
-                return SLOW, f"more than {seconds:.0f} s"
-        if process.returncode in (0, 5):
-            return PASSED, text.strip().splitlines()[-1] if text.strip() else ""
-        failed = [line for line in text.splitlines() if line.startswith(("FAILED", "ERROR"))]
-        return FAILED, failed[0].split(" - ")[0] if failed else f"exit code {process.returncode}"
+    def _commands(self) -> Iterator[tuple[list[str], Path]]:
+        """Yield how each file of the variant of this machine is compiled: AVX2 where it can."""
+        known = json.loads((self.path / "build" / "compile_commands.json").read_text())
+        cpu = Path("/proc/cpuinfo")
+        avx2 = cpu.exists() and " avx2 " in cpu.read_text()
+        by_target: dict[str, list[tuple[list[str], Path]]] = {}
+        for entry in known:
+            words = shlex.split(entry["command"])
+            place = words.index("-o")
+            target = words[place + 1].split("/")[1].removesuffix(".dir")
+            options = [word if word != "-O3" else "-O1" for word in words[:place]]
+            by_target.setdefault(target, []).append((options, Path(entry["file"])))
+        wanted = "epigauge_kernels_v3" if avx2 else "epigauge_kernels"
+        yield from by_target.get(wanted, by_target["epigauge_kernels"])
 
     def environment(self) -> dict[str, str]:
-        """Return the environment in which Python finds the copy."""
-        folders = (self.path / name for name in ("runtime", "generated", "derive"))
-        return os.environ | {
-            "PYTHONPATH": os.pathsep.join(map(str, folders)),
-            "PYTHONDONTWRITEBYTECODE": "1",
+        """Return what has to be set so that Python finds the copy."""
+        return {
+            "PYTHONPATH": os.pathsep.join(self.folders()),
             "OPENBLAS_NUM_THREADS": "1",
             "OMP_NUM_THREADS": "1",
             "MPLBACKEND": "Agg",
             "EPIGAUGE_DATA": os.environ.get("EPIGAUGE_DATA", str(ROOT.parent / "shared/data")),
         }
+
+    def folders(self) -> list[str]:
+        """Return the folders in which the modules of the copy lie."""
+        return [str(self.path / name) for name in ("runtime", "generated", "derive")]
+
+
+def _included(source: Path, root: Path) -> list[Path]:
+    """Return a C file and the headers that it includes, and those include."""
+    found = [source]
+    for path in found:
+        for name in re.findall(r'#include "([\w.]+)"', path.read_text()):
+            here = (root / folder / "c" / name for folder in ("runtime", "generated"))
+            found += [header for header in here if header.exists() and header not in found]
+    return found
 
 
 def _checked(
@@ -178,6 +181,6 @@ def _mirror(source: Path, target: Path) -> None:
             wanted.add(target / path.relative_to(source))
             _refresh(path, target / path.relative_to(source))
     for path in target.rglob("*"):
-        stale = path.is_file() and path not in wanted and path.suffix != ".so"
+        stale = path.is_file() and path not in wanted and path.suffix not in (".so", ".pyc")
         if stale and path.name != "sitecustomize.py":
             path.unlink()
