@@ -62,6 +62,15 @@ def test_exact_images_lead_back_to_the_scene(name):
         assert distance(found, scene.cameras.params) <= 1e-5
 
 
+def test_coefficients_that_replace_others_are_undetermined_but_fit():
+    tracks, scene = network("FULL_OPENCV", 1)
+    refined = models()["FULL_OPENCV"].adjusted
+    start = disturbed(scene, np.random.default_rng(2), len(refined))
+    result = eg.bundle_adjust(tracks, start, refine=refined, max_iter=30)
+    assert result.reconstruction.rms_px(tracks) <= 1e-9 < 1e-3 < start.rms_px(tracks)
+    assert result.success or "undetermined" in result.flags
+
+
 @pytest.mark.parametrize("name", [name for name in METRIC if models()[name].constants])
 def test_constants_cannot_be_refined(name):
     tracks, scene = network(name, 3)

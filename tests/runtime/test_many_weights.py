@@ -77,7 +77,7 @@ def test_an_observation_of_weight_zero_is_one_left_out(backend: str, loss: str) 
 
 
 @pytest.mark.parametrize("backend", ["c", "numpy"])
-@pytest.mark.parametrize("n", [5, 40])
+@pytest.mark.parametrize("n", [5, 60])
 def test_the_cost_weighs_each_observation_with_its_own_weight(backend: str, n: int) -> None:
     # Many views in a chain, given in random order: the solver works on them in another one.
     many_views.need_backend(backend)

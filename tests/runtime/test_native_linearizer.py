@@ -119,7 +119,13 @@ def roots(at: Scene, linearizer: Linearizer, lam: float = 0.1) -> tuple[Array, A
     normal = at.reference(linearizer.loss).linearize(at.cameras, at.points)
     depth = None if normal.depth_blocks is None else normal.depth_blocks[1]
     damping = point_damping(at.model, normal.V, depth)
-    return linearizer.inverse_roots(normal.V, damping, lam, normal.g_points)
+    T, half = linearizer.inverse_roots(normal.V, damping, lam, normal.g_points)
+    # They are roots to the condition of each point, in which two back ends differ.
+    blocks = normal.V + lam * damping
+    off = np.swapaxes(T, 1, 2) @ blocks @ T - np.eye(T.shape[1])
+    assert np.max(np.abs(off).max(axis=(1, 2)) / np.linalg.cond(blocks)) < 1e-14
+    assert relative(half, np.einsum("mij,mi->mj", T, normal.g_points)) < 1e-14
+    return T, half
 
 
 def assert_same(at: Scene, loss: Loss, **options: Any) -> None:

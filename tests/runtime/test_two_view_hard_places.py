@@ -202,6 +202,7 @@ class TestDegenerateScenes:
         result = eg.refine_fundamental(view.x1, view.x1, **form)
         assert_no_nan(result)
         assert result.status > 0
+        assert not result.success
         assert "still camera" in result.flags
         assert "pure rotation" not in result.flags
         assert result.rms_px < 1e-12
