@@ -152,19 +152,20 @@ def _tried(scratch: Scratch, fault: Fault, text: str, reach: Reach) -> dict[str,
     except CannotBuild as error:
         row |= {"verdict": "invalid", "detail": str(error)}
     finally:
-        scratch.restore(fault.file)
+        scratch.write(fault.file, text)
     return row | {"seconds": round(time.perf_counter() - begun, 1)}
 
 
 def _stages(root: Path, fault: Fault, text: str, reach: Reach) -> list[list[str]]:
     """Return the tests for a fault in the order in which they are run."""
     here = area(fault.file)
-    tests: set[str] = set()
-    for module in here.get("through", [fault.file]):
-        tests |= reach.of_file(module)
+    whole = [f"tests/{name}" for name in here["tests"]]
     if fault.file.endswith(".py") and (lines := _statement(fault, text)):
         tests = reach.of_lines(fault.file, lines)
-    whole = [f"tests/{name}" for name in here["tests"]]
+    else:  # what is done at import, or in C
+        tests = {test for test in reach.seconds if test.split("::")[0] in whole}
+        for module in here.get("through", [fault.file]):
+            tests |= reach.of_file(module)
     if fault.file.startswith("derive/"):
         return [[name] for name in whole if (root / name).exists()]
 

@@ -85,19 +85,6 @@ class Scratch:
         if name.startswith("derive/") or name.endswith((".c", ".h")):
             self._link()
 
-    def restore(self, name: str) -> None:
-        """Undo `write`."""
-        text = (ROOT / name).read_text()
-        if name.startswith("derive/"):
-            _refresh(ROOT / name, self.path / name)
-            _mirror(ROOT / "generated", self.path / "generated")
-        elif name.endswith((".c", ".h")):
-            _refresh(ROOT / name, self.path / name)
-        else:
-            self.write(name, text)
-        if name.startswith("derive/") or name.endswith((".c", ".h")):
-            self._link()
-
     def _link(self) -> None:
         """Compile what has changed since it was compiled last, with little optimisation; link."""
         build = self.path / "build"

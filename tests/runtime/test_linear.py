@@ -154,6 +154,30 @@ class TestDense:
         step = changed.solve(0.3, scaled=True) * units
         assert relative(step, system.solve(0.3, scaled=True)) < 1e-11
 
+    @pytest.mark.parametrize("factor", [1e-12, 1e12])
+    def test_steps_do_not_depend_on_the_unit_of_the_cost(self, factor) -> None:
+        # Nor does what lifts a parameter without influence from zero.
+        one = Dense(np.array([1.0, 1e-20]), np.diag([4.0, 0.0]), np.array([4.0, 0.0]))
+        other = Dense(factor * one.gradient, factor * one.hessian, factor * one.diagonal)
+        assert relative(other.solve(0.3, scaled=True), one.solve(0.3, scaled=True)) < 1e-12
+
+    @pytest.mark.parametrize("scaled", [False, True])
+    @pytest.mark.parametrize("share", [0.3749, -0.3749, 0.3751])
+    def test_a_step_bends_where_that_is_short_against_it(self, scaled, share) -> None:
+        # Transtrum and Sethna: twice the correction is at most 0.75 of the step.
+        system, lam = dense(), 0.1
+        straight = system.solve(lam, scaled=scaled)
+        scale = np.sqrt(system.diagonal) if scaled else np.ones(7)
+        damped = system.hessian + lam * np.diag(scale**2)
+        # J^T r''(v, v) that bends the step v by `share` of its length, across it.
+        across = np.roll(straight * scale, 1)
+        across *= share * np.linalg.norm(straight * scale) / np.linalg.norm(across) / scale
+        twice = -2.0 * damped @ across
+        bend = np.multiply.outer(twice, np.outer(straight, straight)) / (straight @ straight) ** 2
+        bent = replace(system, bend=bend).solve(lam, scaled=scaled)
+        taken = 2.0 * abs(share) <= 0.75
+        assert relative(bent, straight + across if taken else straight) < 1e-10
+
 
 class TestArrow:
     @pytest.mark.parametrize("lam", LAMBDAS)
@@ -166,6 +190,26 @@ class TestArrow:
         # Two solutions of a system of condition c agree to about c * 1e-16.
         tolerance = 1e-14 * np.linalg.cond(N + lam * W) + 1e-12
         assert relative(blocks.solve(lam, scaled=scaled), expected) < tolerance
+
+    @pytest.mark.parametrize("scaled", [False, True])
+    def test_solves_with_the_constraints_of_the_border(self, scaled) -> None:
+        blocks, N = arrow(4, m=6, k=3)
+        border = np.random.default_rng(2).standard_normal((*blocks.g_points.shape, 2))
+        full = np.vstack([np.zeros((len(blocks.U), 2)), border.reshape(-1, 2)])
+        damped = N + 0.1 * damping_matrix(scaled, np.diag(N)) + full @ full.T
+        expected = np.linalg.solve(damped, -blocks.gradient)
+        step = replace(blocks, border=border).solve(0.1, scaled=scaled)
+        assert relative(step, expected) < 1e-11
+
+    @pytest.mark.parametrize("factor", [1e-12, 1e12])
+    def test_steps_do_not_depend_on_the_unit_of_the_cost(self, factor) -> None:
+        one, _ = arrow(5)
+        for block in (one.W, one.V):
+            block[2] = 0.0
+        one.g_points[2] = 1e-20
+        parts = ("U", "W", "V", "g_motion", "g_points")
+        other = Arrow(**{name: factor * getattr(one, name) for name in parts})
+        assert relative(other.solve(0.3, scaled=True), one.solve(0.3, scaled=True)) < 1e-12
 
     def test_predicted_is_the_decrease_of_the_quadratic_model(self) -> None:
         blocks, N = arrow(4)

@@ -226,6 +226,10 @@ class TestEndings:
         out = run(linear(system=BlindDense), [1.5, 2.0], stopping=Stopping(0.0, 1e-3, 0.0))
         assert out.status == 3
         assert out.history[-1].step_norm <= 1e-3 < out.history[-2].step_norm
+        # The bound itself is short enough.
+        exact = Stopping(0.0, out.history[-1].step_norm, 0.0)
+        again = run(linear(system=BlindDense), [1.5, 2.0], stopping=exact)
+        assert (again.status, again.nit) == (3, out.nit)
         # A rejected step is short because lambda is large, which proves nothing.
         blocked = linear(cost=jump, system=BlindDense)
         out = run(blocked, [7.0, -3.0], stopping=Stopping(0.0, 1e-3, 0.0))

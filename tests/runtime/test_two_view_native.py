@@ -106,7 +106,7 @@ def test_ends_for_the_reason_it_gives(monkeypatch, options, status, fix):
     for result in both(monkeypatch, scene.x1, scene.x2, fix=fix, **options):
         assert result.status == status
         assert result.success == (status > 0)
-        assert result.message == eg.STATUS[status] if hasattr(eg, "STATUS") else result.message
+        assert result.message.startswith(lm.STATUS[status])
 
 
 def test_status_of_a_start_whose_cost_is_not_finite():
