@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import epigauge as eg
@@ -34,8 +35,7 @@ def median(found: eg.BundleResult, right: Mask) -> float:
     return float(np.median(np.linalg.norm(found.fun[right], axis=1)))
 
 
-@pytest.mark.parametrize("share", [0.002, 0.01, 0.05, 0.1])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("share", "seed"), [(0.002, 0), (0.01, 1), (0.05, 0), (0.1, 1)])
 def test_simulated_tracks_end_as_without_gross_errors(share: float, seed: int) -> None:
     truth = many_views.cameras_and_points(8, 150, seed=seed)
     clean = many_views.observed(truth, seen=0.7, seed=seed)
@@ -52,6 +52,14 @@ def test_simulated_tracks_end_as_without_gross_errors(share: float, seed: int) -
     assert f"{np.count_nonzero(found.rejected)} of {len(tracks)} observations" in found.message
 
 
+@cache
+def clean_median(data_dir: Path, name: str) -> tuple[eg.Tracks, float]:
+    """Return measured tracks, and the median of their residuals without gross errors."""
+    clean = many_views.real_tracks(data_dir, name)
+    found = eg.bundle_adjust(clean, robust=True)
+    return clean, median(found, np.ones(len(clean), dtype=np.bool_))
+
+
 @pytest.mark.parametrize(
     ("name", "share", "seed"),
     [
@@ -66,8 +74,7 @@ def test_simulated_tracks_end_as_without_gross_errors(share: float, seed: int) -
 def test_measured_tracks_end_as_without_gross_errors(
     data_dir: Path, name: str, share: float, seed: int
 ) -> None:
-    clean = many_views.real_tracks(data_dir, name)
-    reference = median(eg.bundle_adjust(clean, robust=True), np.ones(len(clean), dtype=np.bool_))
+    clean, reference = clean_median(data_dir, name)
     tracks, right = spoiled(clean, share, seed)
     found = eg.bundle_adjust(tracks, robust=True)
     assert found.success

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -71,8 +72,7 @@ TAIL = {"triangle with a tail": (4, [(0, 1), (1, 2), (2, 0), (2, 3)])}
 OPEN = RINGS | STARS | CHAINS | TAIL
 
 
-@pytest.mark.parametrize("kind", OPEN)
-@pytest.mark.parametrize("m", [30, 60])
+@pytest.mark.parametrize(("kind", "m"), [*zip(OPEN, itertools.cycle([30, 60]), strict=False)])
 def test_undetermined_networks_end_flagged(kind: str, m: int) -> None:
     n, edges = OPEN[kind]
     tracks = of_pairs(n, edges, m, n)

@@ -12,7 +12,6 @@ from epigauge.two_view.covariance import influence, residual_noise, truncated_de
 from epigauge.two_view.losses import Loss
 from two_views import Array, normalizing
 
-SMOOTH = ("huber", "soft_l1", "cauchy")
 #: Share of wrong matches, and how far off they are in standard deviations of the right ones.
 WRONG = [(0.0, 0.0), (0.05, 60.0), (0.15, 60.0), (0.15, 5.0), (0.3, 60.0), (0.3, 5.0)]
 
@@ -62,17 +61,22 @@ def mean_squared_error(loss: str, share: float, off: float, trials: int, **optio
 
 
 class TestTwoViews:
-    @pytest.mark.parametrize(("share", "off"), WRONG)
-    @pytest.mark.parametrize("loss", SMOOTH)
+    @pytest.mark.parametrize(
+        ("loss", "share", "off"),
+        [
+            *(("huber", *wrong) for wrong in WRONG),
+            *((loss, *wrong) for loss in ("soft_l1", "cauchy") for wrong in WRONG[2::3]),
+        ],
+    )
     def test_errors_are_as_large_as_promised(self, loss, share, off) -> None:
-        # The mean of 80 has a deviation of 0.06; one factor for all matches: up to 2.5. With 30 %
+        # The mean of 60 has a deviation of 0.07; one factor for all matches: up to 2.5. With 30 %
         # far off, a few estimates are drawn away by more than any covariance says.
         most = 1.7 if share * off > 10.0 else 1.35
-        assert 0.75 <= mean_squared_error(loss, share, off, 80, noise_px=None) <= most
+        assert 0.75 <= mean_squared_error(loss, share, off, 60, noise_px=None) <= most
 
-    @pytest.mark.parametrize(("share", "off"), WRONG)
+    @pytest.mark.parametrize(("share", "off"), WRONG[::2])
     def test_truncated_loss(self, share, off) -> None:
-        assert 0.75 <= mean_squared_error("truncated", share, off, 80, noise_px=None) <= 1.6
+        assert 0.75 <= mean_squared_error("truncated", share, off, 60, noise_px=None) <= 1.6
 
     def test_given_noise_scales_the_covariance(self) -> None:
         x1, x2 = disturbed(np.random.default_rng(0), 0.15, 60.0)
@@ -104,7 +108,7 @@ class TestTwoViews:
 
 
 class TestNoise:
-    @pytest.mark.parametrize("loss", [*SMOOTH, "truncated"])
+    @pytest.mark.parametrize("loss", ["huber", "truncated"])
     def test_of_clean_matches_is_consistent(self, loss) -> None:
         rng = np.random.default_rng(7)
         found = []
@@ -127,6 +131,23 @@ class TestNoise:
         a, b = influence(d, w, Loss(), 1, 1.0)
         np.testing.assert_array_equal(a, w)
         np.testing.assert_array_equal(b, w)
+
+    def test_a_loss_without_influence_leaves_the_variance_of_the_residuals(self) -> None:
+        rng = np.random.default_rng(8)
+        d, w = rng.uniform(-1.0, 1.0, 40), rng.uniform(0.5, 2.0, 40) * (np.arange(40) > 3)
+        a, b = influence(d, w, Loss("huber", 1e6), 7, 1.5)
+        np.testing.assert_allclose(a, w, rtol=1e-9)
+        # Each counts with the power of all, freed from the parameters fitted.
+        variance = np.sum(w * d**2) / (36 - 7)
+        np.testing.assert_allclose(b * 1.5**2, w * variance, rtol=1e-9)
+
+    def test_slope_is_that_of_the_influence(self) -> None:
+        # One match alone in the cut: a = w psi'(d), by differences.
+        loss, w = Loss("cauchy", 1.0), np.array([1.0, 1.0])
+        for d in (0.2, 0.7, 3.0):
+            a, _ = influence(np.array([d, 50.0]), w, loss, 0, 4.0)
+            psi = [loss(np.array([x * x]))[1][0] * x for x in (d - 1e-6, d + 1e-6)]
+            assert a[0] == pytest.approx(max((psi[1] - psi[0]) / 2e-6, 0.0), abs=1e-8)
 
 
 def tracks_with_errors(
