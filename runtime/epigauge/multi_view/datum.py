@@ -29,11 +29,15 @@ __all__ = [
     "ConstraintsOfGauge",
     "Projector",
     "freedom",
+    "halves",
     "mapped",
     "projector",
 ]
 
 Array = NDArray[np.float64]
+
+#: Slope of |q| in q = (q1, q2) where q is (q1, 0), far from zero.
+_FIRST_ORDER = np.array([1.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -92,6 +96,17 @@ class Projector:
         """Return S times a motion, shape (12 n + 4 m,) or (12 n + 4 m, r)."""
         return self._scaled(motion) - self.H @ (self.K @ motion)
 
+    def transposed(self, rows: Array) -> Array:
+        """Return S^T times conditions on a motion, shape (12 n + 4 m, r)."""
+        rest = rows - self.K.T @ (self.H.T @ rows)  # K includes L
+        size = self.p.size
+        x, y = rows[:size].reshape(*self.p.shape, -1), rows[size:].reshape(*self.q.shape, -1)
+        x = self.c[:, :, None] * np.einsum("ni,nir->nr", self.p, x)[:, None]
+        y = self.d[:, :, None] * np.einsum("ni,nir->nr", self.q, y)[:, None]
+        return np.asarray(
+            rest - np.concatenate([x.reshape(size, -1), y.reshape(len(rest) - size, -1)])
+        )
+
     def _scaled(self, motion: Array) -> Array:
         """Return L times a motion."""
         size = self.p.size
@@ -127,10 +142,13 @@ def freedom(
     return p, q, np.asarray(np.linalg.svd(moves, full_matrices=False)[0][:, :15])
 
 
-def projector(gauge: Gauge, P: Array, Q: Array) -> Projector:
-    """Return the projector of a gauge at a reconstruction that is in it."""
+def projector(gauge: Gauge, P: Array, Q: Array, slope: Array = _FIRST_ORDER) -> Projector:
+    """Return the projector of a gauge at a reconstruction that is in it.
+
+    `slope` is that of |q| in `halves` for `two_cameras`; (1, 0) is first order.
+    """
     n, m = len(P), len(Q)
-    fixed = _constraints(gauge, P, Q)
+    fixed = _constraints(gauge, P, Q, slope)
     table = kernels.table()
     ones = (np.broadcast_to(np.eye(12), (n, 12, 12)), np.broadcast_to(np.eye(4), (m, 4, 4)))
     p, q, G = freedom(table, P, Q, ones)
@@ -152,7 +170,19 @@ def projector(gauge: Gauge, P: Array, Q: Array) -> Projector:
     return replace(scales, H=H, K=K)
 
 
-def _constraints(gauge: Gauge, P: Array, Q: Array) -> Constraints:
+def halves(H: Array) -> Array:
+    """Return p, q1 and q2 of a camera's H of rank two as conditions on dH, shape (3, 3, 3).
+
+    Its largest singular value is p + |q|: with B = U12^T H V12, p = (B11 + B22) / 2 and
+    q = (B11 - B22, B12 + B21) / 2.
+    """
+    U, _, Vt = np.linalg.svd(H)
+    pairs = np.einsum("ia,bj->abij", U[:, :2], Vt[:2])
+    p, q1 = pairs[0, 0] + pairs[1, 1], pairs[0, 0] - pairs[1, 1]
+    return np.asarray(np.stack([p, q1, pairs[0, 1] + pairs[1, 0]]) / 2.0)
+
+
+def _constraints(gauge: Gauge, P: Array, Q: Array, slope: Array = _FIRST_ORDER) -> Constraints:
     """Return the linearised conditions of a gauge at a reconstruction in it."""
     cameras, points = P.reshape(-1, 12).copy(), Q.copy()
     third = np.tile([0.0, 0.0, 1.0, 0.0], (len(Q), 1))
@@ -169,12 +199,12 @@ def _constraints(gauge: Gauge, P: Array, Q: Array) -> Constraints:
         return Constraints(cameras, third, np.concatenate([rows, basis]))
     if isinstance(gauge, two_cameras):
         H, e = P[gauge.second, :, :3], P[gauge.second, :, 3]
-        U, _, Vt = np.linalg.svd(H)
+        p, *q = halves(H)
         canonic = np.zeros((5, len(P), 3, 4))
         for k in range(3):  # e^T H = 0
             canonic[k, gauge.second, :, k] = e
             canonic[k, gauge.second, :, 3] = H[:, k]
-        canonic[3, gauge.second, :, :3] = np.outer(U[:, 0], Vt[0])  # |H| = 1
+        canonic[3, gauge.second, :, :3] = p + np.tensordot(slope, q, 1)  # |H| = 1
         canonic[4, gauge.second, :, 3] = e  # |e| = 1
         cameras[gauge.second] = canonic[4, gauge.second].ravel()
         basis = np.concatenate([canonic[:4].reshape(4, -1), np.zeros((4, Q.size))], axis=1)

@@ -22,13 +22,10 @@ from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.solve import System
 from epigauge.cameras import camera_model
 from epigauge.errors import ArgumentError
-from epigauge.multi_view.datum import Projector, freedom, mapped, projector
+from epigauge.lengths import linear_length
+from epigauge.multi_view.datum import Projector, freedom, halves, mapped, projector
 from epigauge.multi_view.frame import Frame
-from epigauge.multi_view.gauge import (
-    Gauge,
-    identity,
-    normalized,
-)
+from epigauge.multi_view.gauge import Gauge, identity, normalized, two_cameras
 from epigauge.multi_view.sandwich import Sandwich, influence
 from epigauge.multi_view.tracks import Reconstruction, Tracks
 from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
@@ -54,7 +51,9 @@ class ReconstructionCovariance:
         Standard deviation of an image coordinate of weight one, in pixels: given or estimated.
     projector : Projector
         What takes a motion of the parameters to the gauge: applied on both sides, it takes the
-        covariance in any gauge, brought to this basis and these scales, to the one here.
+        covariance in any gauge, brought to this basis and these scales, to the one here. In
+        `two_cameras` near sigma = 1, where the scale of H* has a kink, this leaves out what moves
+        along the scale without being correlated with anything.
     """
 
     reconstruction: Reconstruction
@@ -62,6 +61,7 @@ class ReconstructionCovariance:
     projector: Projector
     _inverse: Inverse | Sandwich
     _maps: tuple[Array, Array]
+    _wander: Array | None = None
 
     def in_gauge(self, gauge: Gauge) -> ReconstructionCovariance:
         """Return the covariance in another gauge; nothing large is computed again.
@@ -82,7 +82,41 @@ class ReconstructionCovariance:
         cameras, points = there.blocks()
         maps = (cameras @ self._maps[0], points @ self._maps[1])
         there_too = projector(gauge, *moved)
-        return replace(self, reconstruction=Reconstruction(*moved), projector=there_too, _maps=maps)
+        inside = replace(
+            self,
+            reconstruction=Reconstruction(*moved),
+            projector=there_too,
+            _maps=maps,
+            _wander=None,
+        )
+        return inside._across_kink(gauge) if isinstance(gauge, two_cameras) else inside
+
+    def _across_kink(self, gauge: two_cameras) -> ReconstructionCovariance:
+        """Return this with the scale of H* on average, where its singular values are nearly equal.
+
+        The gauge keeps the largest singular value p + |q| (`halves`) at one, and |q| has a kink at
+        zero (sigma = 1). There its mean slope is taken, and what that leaves moves the scale alone.
+        """
+        P, Q = self.reconstruction.P, self.reconstruction.Q
+        H = P[gauge.second, :, :3]
+        rows = np.zeros((2, P.size + Q.size))
+        at = rows[:, : P.size].reshape(2, len(P), 3, 4)
+        at[:, gauge.second, :, :3] = halves(H)[1:]
+        level = projector(gauge, P, Q, np.zeros(2))  # p at its value
+        swapped = (np.swapaxes(self._maps[0], 1, 2), np.swapaxes(self._maps[1], 1, 2))
+        moved = mapped(swapped, level.transposed(rows.T))
+        covariance_of_q = self._variance * moved.T @ self._inverse.apply(moved)
+        values = np.linalg.svd(H, compute_uv=False)
+        mean = np.array([0.5 * (values[0] - values[1]), 0.0])
+        slope, rest = linear_length(mean, 0.5 * (covariance_of_q + covariance_of_q.T))
+        if rest == 0.0:
+            return self
+        # H* and the points' last coordinates grow together.
+        grown = np.zeros(P.size + Q.size)
+        grown[: P.size].reshape(P.shape)[:, :, 3] = -P[:, :, 3]
+        grown[P.size :].reshape(Q.shape)[:, 3] = Q[:, 3]
+        wander = np.sqrt(rest) / values[0] * self.projector._scaled(grown)
+        return replace(self, projector=projector(gauge, P, Q, slope), _wander=wander)
 
     @property
     def cameras(self) -> Array:
@@ -102,7 +136,10 @@ class ReconstructionCovariance:
         X = np.einsum("aibk,blk->aibl", X, blocks, optimize=True).reshape(size, size)
         H, (T, R) = self.projector.H[:size], self._coupled
         found = X - H @ T[:, :size] - T[:, :size].T @ H.T + H @ R @ H.T
-        return np.asarray(0.5 * self._variance * (found + found.T))
+        found = 0.5 * self._variance * (found + found.T)
+        if self._wander is not None:
+            found += np.outer(self._wander[:size], self._wander[:size])
+        return np.asarray(found)
 
     @cached_property
     def points(self) -> Array:
@@ -114,7 +151,11 @@ class ReconstructionCovariance:
         T, R = self._coupled
         HT = H @ T[:, size:].reshape(15, -1, 4).transpose(1, 0, 2)
         found = X - HT - np.swapaxes(HT, 1, 2) + H @ R @ np.swapaxes(H, 1, 2)
-        return np.asarray(0.5 * self._variance * (found + np.swapaxes(found, 1, 2)))
+        found = 0.5 * self._variance * (found + np.swapaxes(found, 1, 2))
+        if self._wander is not None:
+            y = self._wander[size:].reshape(-1, 4)
+            found += y[:, :, None] * y[:, None, :]
+        return np.asarray(found)
 
     @cached_property
     def projections(self) -> Array:
@@ -166,7 +207,8 @@ class ReconstructionCovariance:
             raise ArgumentError("covariance", f"has {size} parameters", f"at most {_DENSE}")
         half = self.projector.apply(mapped(self._maps, np.eye(size)))
         found = half @ self._inverse.apply(half.T)
-        return np.asarray(0.5 * self._variance * (found + found.T))
+        found = 0.5 * self._variance * (found + found.T)
+        return found if self._wander is None else found + np.outer(self._wander, self._wander)
 
     @property
     def _variance(self) -> float:

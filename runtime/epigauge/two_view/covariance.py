@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.lengths import linear_length
 from epigauge.two_view.losses import Loss, robust_scale
 
 __all__ = [
@@ -28,9 +29,6 @@ _CUT = 2.5
 
 #: Least mean slope of the influence of right matches.
 _LEAST = 1e-3
-
-#: Where Gaussian errors are sampled, in standard deviations.
-_NODES = np.linspace(-5.0, 5.0, 31)
 
 
 @dataclass(frozen=True)
@@ -79,12 +77,10 @@ class Uncertainty:
     def of_epipole(self, image: int) -> Array:
         """Return the covariance (3, 3) of an epipole in pixels as a homogeneous unit vector."""
         e, derivative = self._epipole(image)
-        e, derivative = self._epipole(image)
         return self._propagated(_normalization(e) @ derivative)
 
     def of_epipole_px(self, image: int) -> Array:
         """Return the covariance (2, 2) of an epipole in pixels; infinite for one at infinity."""
-        e, derivative = self._epipole(image)
         e, derivative = self._epipole(image)
         if abs(e[2]) <= np.finfo(float).eps * np.linalg.norm(e):
             return np.diag([np.inf, np.inf])
@@ -95,32 +91,23 @@ class Uncertainty:
         """Return the standard deviation of sigma = s2 / s1 in pixels.
 
         Of the block B = U12^T F V12 / s1, changed by dB, ``p = (1 + sigma + dB11 + dB22) / 2`` and
-        ``q = |(1 - sigma + dB11 - dB22, dB12 + dB21)| / 2`` give sigma = (p - q) / (p + q). Away
-        from 1 this is linearised, d sigma = (u2^T dF v2 - sigma u1^T dF v1) / s1. Where q is within
-        three deviations of its kink at zero, it is integrated over Gaussian dB instead.
+        ``q = (1 - sigma + dB11 - dB22, dB12 + dB21) / 2`` give sigma = (p - |q|) / (p + |q|). Away
+        from sigma = 1 this is linearised, d sigma = (u2^T dF v2 - sigma u1^T dF v1) / s1. Near it
+        |q| has a kink: `epigauge.lengths.linear_length` says what stands for its derivative.
         """
         F, entry_map = self._pixels
         U, s, Vt = np.linalg.svd(F)
         sigma = float(s[1] / s[0])
         block = np.kron(U[:, :2].T, Vt[:2]) @ entry_map / s[0]
         halves = np.array([[1.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, -1.0], [0.0, 1.0, 1.0, 0.0]]) / 2.0
-        covariance = self._propagated(halves @ block)
+        by_halves = halves @ block
+        covariance = self._propagated(by_halves)
         if not np.isfinite(covariance).all():
             return float("inf")
-        if (1.0 - sigma) / 2.0 >= 3.0 * np.sqrt(covariance[2, 2]):
-            linear = block[3:] - sigma * block[:1]
-            return float(np.sqrt(self._propagated(linear)[0, 0]))
-        values, vectors = np.linalg.eigh(covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        # A regular grid: a Gaussian rule is for smooth functions
-        grid = np.stack(np.meshgrid(_NODES, _NODES, _NODES)).reshape(3, -1)
-        weight = np.exp(-0.5 * np.sum(grid**2, axis=0))
-        centre = np.array([[1.0 + sigma], [1.0 - sigma], [0.0]]) / 2.0
-        p, q1, q2 = centre + root @ grid
-        q = np.hypot(q1, q2)
-        ratio = np.abs(p - q) / (np.abs(p) + q)
-        mean = np.average(ratio, weights=weight)
-        return float(np.sqrt(np.average((ratio - mean) ** 2, weights=weight)))
+        p, q = 0.5 * (1.0 + sigma), 0.5 * (1.0 - sigma)
+        slope, rest = linear_length(np.array([q, 0.0]), covariance[1:, 1:])
+        derivative = 2.0 * q * by_halves[:1] - 2.0 * p * slope @ by_halves[1:]
+        return float(np.sqrt(self._propagated(derivative)[0, 0] + 4.0 * p**2 * rest))
 
     def largest(self) -> float:
         """Return the largest standard deviation of the conditioned F of unit norm."""
