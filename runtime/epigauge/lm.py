@@ -41,8 +41,8 @@ STATUS = {
     -4: "stopped where the points are not at their minimum for this F: a better start is needed",
     -3: "the cost at the start is not finite",
     -2: "stopped by the callback",
-    -1: "stopped short of a minimum: no step reduces the cost, however short, as gross errors or a "
-    "bad start bring about: use a robust loss or another start",
+    -1: "stopped short of a minimum: no step of this method lowers the cost, however short, as "
+    "gross errors or a bad start bring about: use a robust loss, another start or method",
     0: "max_iter trial steps taken without convergence",
     1: "converged: gradient below gtol",
     2: "converged: relative decrease of the cost below ftol",

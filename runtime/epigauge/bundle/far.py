@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
@@ -9,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import lm
+from epigauge.bundle.dampings import Covariant
 from epigauge.bundle.problem import BundleProblem, BundleState, Estimate
 from epigauge.bundle.solve import BundleSystem, Step
 from epigauge.two_view.losses import Loss, median
 
-__all__ = ["FAR", "JumpingProblem", "minimize", "minimized_from"]
+__all__ = ["FAR", "JumpingProblem", "minimize", "minimized_from", "short_of_minimum"]
 
 Array = NDArray[np.float64]
 
@@ -28,6 +30,13 @@ _SCALE = 0.05
 #: When the steps that bring it nearer end: relative decrease of their cost, and trial steps.
 _FTOL, _STEPS = 1e-3, 15
 
+
+#: A method has stopped short of a minimum where this many covariant steps lower the cost by this
+#: part of it.
+_CHECKING, _SHORT = 3, 1e-4
+
+#: Steps from a far start to compare with.
+_AGAIN = 50
 
 #: Relative size of the change that makes a degenerate start regular.
 _NUDGE = 1e-3
@@ -112,8 +121,7 @@ def minimize(
         Of all steps. The costs of its history are those asked for, which the first steps, accepted
         by another loss, need not lower one by one.
     """
-    distances = problem.linearizer.distances(start.cameras, start.points)
-    if not np.isfinite(distances).all() or median(distances) <= FAR:
+    if not _is_far(problem, start):
         return lm.minimize(problem, start, damping, schedule, stopping, callback, scale)
     jumping = _Watched(JumpingProblem.of(problem), problem)
     history: list[lm.Row] = []
@@ -156,6 +164,41 @@ def minimize(
         nit=first.nit + second.nit,
         history=tuple(history),
     )
+
+
+def short_of_minimum(problem: BundleProblem, state: BundleState, start: Estimate) -> bool:
+    """Tell whether the default method lowers a cost by much, in a few steps or from a far start.
+
+    Parameters
+    ----------
+    problem : BundleProblem
+        Of homogeneous cameras, free in all, with the measurements that the state was found from.
+    state : BundleState
+        Where another method stopped, in the best conditioned basis.
+    start : Estimate
+        Where it began, in such a basis, too.
+    """
+    if not math.isfinite(state.cost) or state.cost <= problem.floor:
+        return False
+    costs = problem.linearizer.point_costs(state.cameras, state.points)
+    jumped, others = problem.refined(state.cameras, problem.linearizer.intersect(state.cameras))
+    better = np.less(*(np.nan_to_num(cost, nan=np.inf) for cost in (others, costs)))
+    points = np.where(better[:, None], jumped, state.points)
+    few = lm.Stopping(ftol=_SHORT, xtol=0.0, gtol=0.0, max_iter=_CHECKING)
+    damping, schedule = Covariant(), lm.Classic()
+    found = lm.minimize(problem, Estimate(state.cameras, points), damping, schedule, few)
+    if found.state.cost < (1.0 - _SHORT) * state.cost:
+        return True
+    if not _is_far(problem, start):
+        return False
+    again = lm.Stopping(ftol=_SHORT, xtol=0.0, gtol=0.0, max_iter=_AGAIN)
+    found = minimize(problem, start, damping, schedule, again, None, 1.0)
+    return found.state.cost < (1.0 - _SHORT) * state.cost
+
+
+def _is_far(problem: BundleProblem, start: Estimate) -> bool:
+    distances = problem.linearizer.distances(start.cameras, start.points)
+    return bool(np.isfinite(distances).all()) and median(distances) > FAR
 
 
 def minimized_from(

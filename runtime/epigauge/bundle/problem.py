@@ -21,6 +21,10 @@ from epigauge.cameras import MAX_FOCAL, MIN_FOCAL, CameraModel
 __all__ = ["BundleProblem", "BundleState", "Estimate"]
 
 Array = NDArray[np.float64]
+
+#: Largest entry of a homogeneous vector; lambda diag(N) leaves scales as free as they come.
+_LARGE = 1e30
+
 Retraction = Callable[[Array, Array], Array]
 
 
@@ -146,6 +150,8 @@ class BundleProblem:
         cameras = self.freedom.retracted(state.cameras, cameras, step.cameras)
         points, steps = state.points + step.points, state.estimate.steps + 1
         cameras, points = self.freedom.settled(cameras, points, steps)
+        if self.model.homogeneous:
+            cameras, points = _in_range(cameras), _in_range(points)
         if self.refinement is None:
             return Estimate(cameras, points, steps)
         refined, costs = self.refined(cameras, points)
@@ -165,3 +171,14 @@ class BundleProblem:
         places = list(self.model.focal)
         focal = cameras[:, 12:][:, places]
         return bool(np.all((focal >= MIN_FOCAL) & (focal <= MAX_FOCAL)))
+
+
+def _in_range(vectors: Array) -> Array:
+    """Return homogeneous vectors, those whose scale has run away as unit vectors."""
+    sizes = np.abs(vectors).max(axis=1, keepdims=True)
+    away = (sizes > _LARGE) | ((sizes < 1.0 / _LARGE) & (sizes > 0.0))
+    if not away.any():
+        return vectors
+    unit = vectors / np.where(away, sizes, 1.0)
+    lengths = np.linalg.norm(unit, axis=1, keepdims=True)
+    return np.asarray(unit / np.where(away, lengths, 1.0))

@@ -159,6 +159,17 @@ def minimized(
     home = isinstance(act, Covariant) and gauge is None and wanted is None
     homogeneous = job.model.homogeneous
 
+    def checked(cameras: Array, points: Array, state: BundleState, begun: Estimate) -> bool:
+        """Tell whether the default method finds nothing lower, either."""
+        free = bundle_problem(
+            *(job.model, kernels, graph, job.q, weights, loss), embedded=True, workers=workers
+        )
+        there = best_conditioned(job.model, cameras, points)
+        moved = BundleState(Estimate(*there.apply(cameras, points)), state.cost)
+        there = best_conditioned(job.model, begun.cameras, begun.points)
+        start = Estimate(*there.apply(begun.cameras, begun.points))
+        return not far.short_of_minimum(free, moved, start)
+
     def attempt(cameras: Array, points: Array) -> tuple[lm.Outcome[BundleState], Array, Array]:
         start = job.model, cameras, points
         there = best_conditioned(*start) if home else move_into(wanted or identity(), *start)
@@ -190,6 +201,9 @@ def minimized(
             # The verdict on metric cameras is about the system, which the compiled loop leaves out.
             outcome = replace(outcome, system=problem.linearize(outcome.state))
         found = outcome.state.cameras, outcome.state.points
+        claims = homogeneous and outcome.status > 0 and not jumps
+        if claims and not checked(*found, outcome.state, begun):
+            outcome = replace(outcome, status=-1)
         return (outcome, *(there.inverse().apply(*found) if home else found))
 
     try:

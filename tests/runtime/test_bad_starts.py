@@ -1,0 +1,96 @@
+"""Bad starts end at the optimum or say that they do not; flat scenes are alike in every basis."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import epigauge as eg
+import numpy as np
+import pytest
+from epigauge.bundle import dampings, problem
+from epigauge.reproduce.gauge_runs import moved, random_transformation
+
+
+def hopeless(flatness: float, seed: int) -> tuple[eg.Tracks, eg.Reconstruction]:
+    """Return a scene, and a start whose errors are as large as its cameras and points."""
+    scene = eg.multi_view_scene(flatness, n_points=40, seed=seed)
+    random = np.random.default_rng(seed)
+    P = np.diag([1e-3, 1e-3, 1.0]) @ scene.true.P
+    P /= np.linalg.norm(P, axis=(1, 2), keepdims=True)
+    Q = scene.true.Q / np.linalg.norm(scene.true.Q, axis=1, keepdims=True)
+    P = P + random.normal(size=P.shape) / 3.5
+    return scene.tracks, eg.Reconstruction(
+        np.diag([1e3, 1e3, 1.0]) @ P, Q + random.normal(size=Q.shape) / 2.0
+    )
+
+
+@pytest.mark.parametrize("seed", [10, 13])
+def test_marquardt_does_not_call_a_bad_place_a_success(seed: int) -> None:
+    tracks, start = hopeless(0.5, seed)
+    best = eg.bundle_adjust(tracks).cost
+    found = eg.bundle_adjust(tracks, start, method="marquardt", max_iter=500)
+    assert found.cost > 1.4 * best  # or the start is no longer a bad one
+    assert found.status == -1
+    assert not found.success
+    assert "another start" in found.message
+
+
+@pytest.mark.parametrize("method", ["marquardt", "levenberg", "free", "mclauchlan"])
+def test_the_optimum_is_a_success_of_every_method(method: str) -> None:
+    tracks = eg.multi_view_scene(0.3, n_points=30, seed=2).tracks
+    best = eg.bundle_adjust(tracks)
+    found = eg.bundle_adjust(tracks, method=method)
+    assert found.success
+    assert found.cost == pytest.approx(best.cost, rel=1e-6)
+
+
+def test_scales_that_run_away_leave_the_images_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    # lambda diag(N) lets the scale of this start's points grow beyond 1e100.
+    tracks, start = hopeless(0.05, 9)
+    found = eg.bundle_adjust(tracks, start, method="marquardt", max_iter=200)
+    assert np.abs(found.reconstruction.Q).max() < 1e31
+    again = 0.5 * np.sum((tracks.xy - found.reconstruction.project(tracks)) ** 2)
+    assert again == pytest.approx(found.cost, rel=1e-9)
+    vectors = np.random.default_rng(0).normal(size=(5, 4)) * [[1e40], [1.0], [1e-40], [1e30], [0]]
+    kept = problem._in_range(vectors)
+    np.testing.assert_array_equal(kept[[1, 4]], vectors[[1, 4]])
+    cosines = np.sum(
+        kept[[0, 2]] / np.abs(vectors[[0, 2]]).max(axis=1)[:, None] * vectors[[0, 2]], 1
+    )
+    assert (cosines > 0.0).all()
+    np.testing.assert_allclose(np.linalg.norm(kept[[0, 2]], axis=1), 1.0, rtol=1e-12)
+
+
+class TestLambdaFloor:
+    """Below a least lambda rounding decides on steps along what a flat scene hardly determines."""
+
+    @staticmethod
+    def runs(**options: Any) -> list[eg.BundleResult]:
+        tracks = eg.multi_view_scene(0.02, seed=0).tracks
+        start, random = eg.initialize(tracks), np.random.default_rng(0)
+        bases = [random_transformation(random, c, 5, 100) for c in (1.0, 1.0, 100.0)]
+        return [
+            eg.bundle_adjust(tracks, moved(start, basis), ftol=1e-10, **options) for basis in bases
+        ]
+
+    @staticmethod
+    def apart(runs: list[eg.BundleResult]) -> float:
+        costs = np.array([[row.cost for row in run.history[:24]] for run in runs])
+        return float(np.abs(costs / costs[0] - 1.0).max())
+
+    @pytest.mark.parametrize("loop", ["compiled", "python"])
+    def test_flat_scenes_take_the_same_steps_in_every_basis(self, loop: str) -> None:
+        options = {"callback": lambda _: False} if loop == "python" else {}
+        runs = self.runs(**options)
+        assert len({run.nit for run in runs}) == 1
+        assert sum(row.accepted for row in runs[0].history) > 12
+        assert self.apart(runs) < 1e-9
+        lams = np.array([row.lam for row in runs[0].history[1:]])
+        assert lams.min() == pytest.approx(dampings.LAM_FLOOR * lams[0], rel=1e-9)
+
+    def test_without_the_floor_they_would_not(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(dampings.Covariant, "lam_floor", 0.0)
+        runs = self.runs()
+        lams = np.array([row.lam for row in runs[0].history[1:]])
+        assert lams.min() < dampings.LAM_FLOOR * lams[0]
+        assert len({run.nit for run in runs}) > 1 or self.apart(runs) > 1e-9
