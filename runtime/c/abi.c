@@ -15,6 +15,7 @@ EG_EXPORT ptrdiff_t eg_shared_size(const char *name)
         {"eg_envelope", sizeof(eg_envelope)},
         {"eg_refinement", sizeof(eg_refinement)},
         {"eg_bundle_options", sizeof(eg_bundle_options)},
+        {"eg_bundle_normal", sizeof(eg_bundle_normal)},
         {"eg_options", sizeof(eg_options)},
         {"eg_outcome", sizeof(eg_outcome)},
     };

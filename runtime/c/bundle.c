@@ -68,19 +68,18 @@ int eg_bundle_linearize(
     const eg_route route = eg_route_of(bundle);
     const ptrdiff_t b = route.point, block = b * (b + 1) / 2;
     eg_pass p;
-    if (eg_pass_begin(&p, bundle, &route, begin, end, 2 * route.sums, 0))
+    if (eg_pass_begin(&p, bundle, &route, begin, end, route.sums, 0))
         return 1;
     for (ptrdiff_t c = begin; c < end; ++c) {
         eg_pass_chunk(&p, c, points);
         const ptrdiff_t M = p.chunk.M, size = route.sums * M;
-        double *sums = p.extra, *own = sums + size;
+        double *sums = p.extra;
         if (route.factored)
             eg_moments(M, p.points, p.moments);
         memset(sums, 0, (size_t)size * sizeof(double));
         for (ptrdiff_t s = 0; s < p.chunk.L; ++s) {
             eg_pass_slot(&p, s, cameras);
-            route.observe(&p, own, camera_sums);
-            eg_add(size, own, sums);
+            route.observe(&p, sums, camera_sums);
         }
         eg_scatter_symmetric(&p.chunk, b, sums, V);
         if (route.factored)
@@ -92,16 +91,14 @@ int eg_bundle_linearize(
 }
 
 /* Normal equations and costs of the points of a chunk at `points`, cameras gathered slot by slot. */
-static void normal(eg_pass *p, double *cameras, const double *points, double *own,
-                   double *EG_RESTRICT sums, double *EG_RESTRICT costs)
+static void normal(eg_pass *p, double *cameras, const double *points, double *sums, double *costs)
 {
     const ptrdiff_t M = p->chunk.M, size = p->route->sums * M;
     memset(sums, 0, (size_t)size * sizeof(double));
     memset(costs, 0, (size_t)M * sizeof(double));
     for (ptrdiff_t s = 0; s < p->chunk.L; ++s) {
         eg_pass_slot_of(p, s, cameras + p->route->camera * s * M);
-        p->route->sight(p, points, own);
-        eg_add(size, own, sums);
+        p->route->sight(p, points, sums);
         eg_charge(p, costs);
     }
 }
@@ -129,19 +126,19 @@ int eg_bundle_refine_points(
     const eg_route route = eg_route_of(bundle);
     const ptrdiff_t b = route.point, n = route.sums;
     eg_pass p;
-    if (eg_pass_begin(&p, bundle, &route, begin, end, b + 3 * n + 31, route.camera))
+    if (eg_pass_begin(&p, bundle, &route, begin, end, b + 2 * n + 31, route.camera))
         return 1;
     for (ptrdiff_t c = begin; c < end; ++c) {
         eg_pass_chunk(&p, c, points);
         const ptrdiff_t M = p.chunk.M;
-        double *trial = p.extra, *own = trial + b * M, *sums = own + n * M, *cost = sums + n * M;
+        double *trial = p.extra, *sums = trial + b * M, *cost = sums + n * M;
         double *sums_trial = cost + M, *cost_trial = sums_trial + n * M;
         double *lams = cost_trial + M, *promised = lams + M, *better = promised + M;
         double *scratch = better + M, *gathered = scratch + 26 * M;
         for (ptrdiff_t s = 0; s < p.chunk.L; ++s)
             eg_gather(M, route.camera, cameras, p.chunk.view + s * M,
                       gathered + route.camera * s * M);
-        normal(&p, gathered, p.points, own, sums, cost);
+        normal(&p, gathered, p.points, sums, cost);
         for (ptrdiff_t j = 0; j < M; ++j)
             lams[j] = how->lam;
         for (ptrdiff_t pass = 0; pass < how->iterations; ++pass) {
@@ -159,7 +156,7 @@ int eg_bundle_refine_points(
             if (!any)
                 break;
             eg_add(b * M, p.points, trial);
-            normal(&p, gathered, trial, own, sums_trial, cost_trial);
+            normal(&p, gathered, trial, sums_trial, cost_trial);
             EG_SIMD
             for (ptrdiff_t j = 0; j < M; ++j)
                 better[j] = promised[j] > how->tolerance * cost[j] && cost_trial[j] < cost[j]

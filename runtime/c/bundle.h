@@ -135,6 +135,10 @@ EG_EXPORT int eg_resect(
 
 /* ---------------------------------------------------------------- bundle_minimize.c */
 
+/* Do `part` of `work` for all numbers below `count`, at the same time if possible. */
+typedef void eg_part(void *work, ptrdiff_t number);
+typedef void eg_share(eg_part *part, void *work, ptrdiff_t count);
+
 /* How cameras and points are minimised over, all of them free. */
 typedef struct {
     eg_refinement refinement;
@@ -145,11 +149,21 @@ typedef struct {
     const int32_t *focal;   /* places of focal lengths in a stored camera */
     ptrdiff_t focals;
     double min_focal, max_focal;
+    eg_share *share;          /* NULL where one thread does all */
+    ptrdiff_t n_passes, n_pairs;
+    const ptrdiff_t *passes;  /* (n_passes + 1): edges of the threads' ranges of chunks */
+    const ptrdiff_t *pairs;   /* (n_pairs + 1): the same for passes over pairs of observations */
+    const volatile int *stop; /* the loop ends before its next step where this is not zero */
 } eg_bundle_options;
+
+/* The normal equations at the end, as of `eg_bundle_linearize` and `eg_bundle_camera_blocks`. */
+typedef struct {
+    double *U, *V, *g, *g_points;
+} eg_bundle_normal;
 
 EG_EXPORT int eg_bundle_minimize(
     const eg_bundle *bundle, const eg_envelope *views, const eg_envelope *panels,
-    const eg_bundle_options *options, double *cameras, double *points, double *history,
-    double *cost, ptrdiff_t *counts);
+    const eg_bundle_options *options, double *cameras, double *points,
+    const eg_bundle_normal *normal, double *history, double *cost, ptrdiff_t *counts);
 
 #endif

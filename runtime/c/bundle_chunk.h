@@ -24,6 +24,7 @@ typedef struct {
 } eg_chunk;
 
 typedef struct eg_route eg_route;
+typedef struct eg_group eg_group;
 
 /* A pass over chunks: where it is, and its memory. Arrays of lanes are observation-last. */
 typedef struct {
@@ -53,23 +54,31 @@ struct eg_route {
     ptrdiff_t padded;        /* width of the rows of sums */
     ptrdiff_t camera_sums, pair_sums; /* doubles a camera and a pair of cameras */
     ptrdiff_t sums;          /* rows of a point's sums: V, its damping where it has one, g */
-    ptrdiff_t factors;       /* rows of an observation's factors of the coupling */
+    ptrdiff_t factors;       /* rows an observation that `turn` keeps of a chunk */
     ptrdiff_t turned;        /* doubles an observation when pairs are added */
     ptrdiff_t work;          /* rows of scratch */
     /* Squared residuals. */
     void (*squared)(const eg_pass *);
-    /* Sums of points, weights, squared residuals. */
-    void (*sight)(const eg_pass *, const double *points, double *own);
+    /* Add to the sums of points; weights, squared residuals. */
+    void (*sight)(const eg_pass *, const double *points, double *sums);
     /* The same, and add to the sums of cameras. */
-    void (*observe)(const eg_pass *, double *own, double *cameras);
-    /* Factors F of the coupling of cameras and points times roots T of the points. */
-    void (*couple)(const eg_pass *, const double *roots, double *F);
-    /* v += (W T)^T x for x of the cameras, (tangent, M); cameras += W T v. */
-    void (*to_points)(const eg_pass *, const double *F, const double *x, double *v);
-    void (*to_cameras)(const eg_pass *, const double *F, const double *v, double *cameras);
-    /* Add W T T^T W^T of all pairs of observations of each point to their pairs of views. */
-    void (*pairs)(const eg_pass *, const eg_envelope *, const double *F, double *turned,
-                  ptrdiff_t *views, int32_t *sorted, double *pairs);
+    void (*observe)(const eg_pass *, double *sums, double *cameras);
+    /* v += (W T)^T x for x of the cameras, (tangent, M). */
+    void (*to_points)(const eg_pass *, const double *roots, const double *x, double *v);
+    /* cameras += W T v. */
+    void (*to_cameras)(const eg_pass *, const double *roots, const double *v, double *cameras);
+    /* Turn the factors W T of a chunk into those of a group, behind what it has; cameras += W T v
+       unless v is NULL. May add pairs on its own, and leave the group as it is. */
+    void (*turn)(eg_pass *, const double *cameras, const double *roots, const double *v,
+                 const eg_envelope *, eg_group *, double *pairs, double *reduced);
+    /* Add W T T^T W^T of all pairs of observations of each point of a group to their pairs of
+       views. */
+    void (*pairs)(const eg_route *, const eg_envelope *, eg_group *, double *pairs);
+    /* Of the direct route, for its width of rows: add residuals r and Jacobians J of a slot to the
+       sums of its cameras; turn those of slot s, lanes beginning at `first` in the group. */
+    void (*add_cameras)(const eg_pass *, const double *r, const double *J, double *cameras);
+    void (*turn_slot)(const eg_pass *, const double *J, const double *Z, const double *v,
+                      const int32_t *first, ptrdiff_t s, eg_group *, double *reduced);
 };
 
 /* In bundle_factored.c and bundle_direct.c. */
@@ -95,8 +104,18 @@ static inline eg_chunk eg_chunk_of(const eg_bundle *b, ptrdiff_t c)
     return chunk;
 }
 
-/* Scratch memory for the largest of some chunks, so many doubles a lane and a row; aligned to cache
-   lines. NULL where there is none. To be released by `eg_release`. */
+/* Memory that begins at a cache line; NULL where there is none. To be released by `eg_release`. */
+static inline double *eg_aligned(ptrdiff_t size)
+{
+    void *whole = malloc((size_t)(size + 16) * sizeof(double));
+    if (!whole)
+        return 0;
+    double *aligned = (double *)(((uintptr_t)whole + 2 * 64) & ~(uintptr_t)63);
+    ((void **)aligned)[-1] = whole;
+    return aligned;
+}
+
+/* Such memory for the largest of some chunks, so many doubles a lane and a row. */
 static inline double *eg_scratch(const eg_bundle *b, ptrdiff_t begin, ptrdiff_t end,
                                  ptrdiff_t a_lane, ptrdiff_t a_row)
 {
@@ -107,12 +126,7 @@ static inline double *eg_scratch(const eg_bundle *b, ptrdiff_t begin, ptrdiff_t 
         if (own > size)
             size = own;
     }
-    void *whole = malloc((size_t)(size + 16) * sizeof(double));
-    if (!whole)
-        return 0;
-    double *aligned = (double *)(((uintptr_t)whole + 2 * 64) & ~(uintptr_t)63);
-    ((void **)aligned)[-1] = whole;
-    return aligned;
+    return eg_aligned(size);
 }
 
 static inline void eg_release(double *scratch)
@@ -133,10 +147,14 @@ static inline ptrdiff_t eg_filled(const eg_chunk *chunk, ptrdiff_t s, ptrdiff_t 
 static inline void eg_gather(ptrdiff_t M, ptrdiff_t width, const double *rows, const int32_t *index,
                              double *EG_RESTRICT out)
 {
-    for (ptrdiff_t j = 0; j < M; ++j) {
-        const double *row = rows + width * index[j];
-        for (ptrdiff_t k = 0; k < width; ++k)
-            out[k * M + j] = row[k];
+    for (ptrdiff_t j = 0; j < M; j += 4) { /* M is a multiple of EG_LANES */
+        const double *EG_RESTRICT a = rows + width * index[j];
+        const double *EG_RESTRICT b = rows + width * index[j + 1];
+        const double *EG_RESTRICT c = rows + width * index[j + 2];
+        const double *EG_RESTRICT d = rows + width * index[j + 3];
+        double *EG_RESTRICT to = out + j;
+        for (ptrdiff_t k = 0; k < width; ++k, to += M)
+            to[0] = a[k], to[1] = b[k], to[2] = c[k], to[3] = d[k];
     }
 }
 

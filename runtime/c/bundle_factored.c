@@ -8,21 +8,23 @@ static void squared(const eg_pass *p)
     eg_squared_distance(p->chunk.M, p->cameras, p->points, p->q, p->squared);
 }
 
-static void sight(const eg_pass *p, const double *points, double *own)
+static void sight(const eg_pass *p, const double *points, double *sums)
 {
     const ptrdiff_t M = p->chunk.M;
+    double *own = p->work + 10 * M;
     if (p->bundle->loss != EG_LINEAR)
         eg_squared_distance(M, p->cameras, points, p->q, p->squared);
     eg_weigh(p);
     eg_point_normal(M, p->cameras, points, p->q, p->w, own, own + 10 * M, own + 20 * M, p->squared);
+    eg_add(24 * M, own, sums);
 }
 
 /* Sums of a camera: for the six entries of w a^T a and for depth the moments Q Q^T, then e Q^T. */
-static void observe(const eg_pass *p, double *own, double *cameras)
+static void observe(const eg_pass *p, double *sums, double *cameras)
 {
     const ptrdiff_t M = p->chunk.M;
     double *factors = p->work;
-    sight(p, p->points, own);
+    sight(p, p->points, sums);
     eg_camera_normal(M, p->cameras, p->points, p->q, p->w, factors, factors + 6 * M,
                      factors + 7 * M);
     for (ptrdiff_t j = 0, next; j < p->filled; j = next) {
@@ -45,11 +47,12 @@ static void couple(const eg_pass *p, const double *roots, double *F)
     eg_coupling(p->chunk.M, p->cameras, p->points, p->w, roots, F);
 }
 
-static void to_points(const eg_pass *p, const double *F, const double *x, double *v)
+static void to_points(const eg_pass *p, const double *roots, const double *x, double *v)
 {
     const ptrdiff_t M = p->chunk.M;
     const double *Q = p->points;
-    double *moved = p->work;
+    double *moved = p->work, *F = moved + 10 * M;
+    couple(p, roots, F);
     for (int a = 0; a < 3; ++a) {
         EG_SIMD
         for (ptrdiff_t j = 0; j < M; ++j)
@@ -65,7 +68,7 @@ static void to_points(const eg_pass *p, const double *F, const double *x, double
     }
 }
 
-static void to_cameras(const eg_pass *p, const double *F, const double *v, double *cameras)
+static void add_to_cameras(const eg_pass *p, const double *F, const double *v, double *cameras)
 {
     const ptrdiff_t M = p->chunk.M;
     double *y = p->work;
@@ -82,6 +85,59 @@ static void to_cameras(const eg_pass *p, const double *F, const double *v, doubl
     }
 }
 
+static void to_cameras(const eg_pass *p, const double *roots, const double *v, double *cameras)
+{
+    double *F = p->work + 10 * p->chunk.M;
+    couple(p, roots, F);
+    add_to_cameras(p, F, v, cameras);
+}
+
+/* Lanes that hold a point, where all of these are seen by the same views, once; else 0. */
+static ptrdiff_t alike(const eg_chunk *chunk)
+{
+    const ptrdiff_t M = chunk->M, lanes = eg_filled(chunk, 0, M);
+    if (chunk->count[lanes - 1] < chunk->count[0])
+        return 0;
+    for (ptrdiff_t s = 0; s < chunk->L; ++s)
+        if (eg_run(chunk->view + s * M, 0, lanes) < lanes
+            || (s && chunk->view[s * M] == chunk->view[(s - 1) * M]))
+            return 0;
+    return lanes;
+}
+
+/* Copy the factors of a chunk behind those of a group: rows of 12 an observation. */
+static void append(const eg_pass *p, const double *F, eg_group *group)
+{
+    const eg_chunk *chunk = &p->chunk;
+    const ptrdiff_t M = chunk->M, lanes = eg_filled(chunk, 0, M);
+    const int32_t *first = group->first + group->lanes;
+    memcpy(group->moments + 16 * group->lanes, p->moments, (size_t)(16 * lanes) * sizeof(double));
+    eg_group_append(group, chunk);
+    for (ptrdiff_t s = 0; s < chunk->L; ++s)
+        for (ptrdiff_t j = 0; j < lanes && s < chunk->count[j]; ++j)
+            for (ptrdiff_t k = 0; k < 12; ++k)
+                group->turned[12 * (first[j] + s) + k] = F[(12 * s + k) * M + j];
+}
+
+static void turn(eg_pass *p, const double *cameras, const double *roots, const double *v,
+                 const eg_envelope *envelope, eg_group *group, double *pairs, double *reduced)
+{
+    const ptrdiff_t M = p->chunk.M, lanes = alike(&p->chunk);
+    double *F = p->extra + 20 * M; /* behind v and roots */
+    eg_moments(M, p->points, p->moments);
+    for (ptrdiff_t s = 0; s < p->chunk.L; ++s) {
+        double *own = F + 12 * s * M;
+        eg_pass_slot(p, s, cameras);
+        couple(p, roots, own);
+        if (v)
+            add_to_cameras(p, own, v, reduced);
+    }
+    if (lanes)
+        eg_factored_pairs_alike(p, envelope, lanes, F, pairs);
+    else
+        append(p, F, group);
+}
+
 const eg_route eg_factored_route = {
     .factored = 1,
     .camera = 12,
@@ -93,12 +149,12 @@ const eg_route eg_factored_route = {
     .sums = 24,
     .factors = 12,
     .turned = 12,
-    .work = 10,
+    .work = 10 + 24,
     .squared = squared,
     .sight = sight,
     .observe = observe,
-    .couple = couple,
     .to_points = to_points,
     .to_cameras = to_cameras,
+    .turn = turn,
     .pairs = eg_factored_pairs,
 };

@@ -1,5 +1,4 @@
-/* The whole minimisation over many views with the covariant damping, points refined after each step:
-   for problems so small that calls from Python between its parts would cost more than they. */
+/* The whole minimisation over many views with the covariant damping, points refined after each step. */
 #include <math.h>
 
 #include "bundle_chunk.h"
@@ -15,13 +14,15 @@ typedef struct {
     const eg_bundle_options *options;
     eg_route route;
     ptrdiff_t n, m, d, b;
-    int failed; /* memory ran out */
+    int failed;      /* memory ran out */
+    double lam;      /* of the step being made */
+    double *statuses; /* of the parts of a pass: not zero where one failed */
     double *cameras, *points;             /* the estimate */
     double *trial_cameras, *trial_points; /* refined already */
     double *costs;                        /* of the trial's points */
     double *U, *V, *D, *g, *g_points, *D_points; /* normal equations; dampings */
     double *sums, *pairs, *blocks;        /* as the passes add up */
-    double *A, *white, *S, *x, *step, *T, *half, *coupled, *point_step;
+    double *A, *white, *S, *x, *step, *T, *half, *coupled_cameras, *coupled, *point_step;
     double *lanes; /* cameras, steps and moved cameras, observation-last */
 } state;
 
@@ -33,10 +34,44 @@ static double total(state *s, const double *costs)
     return 0.5 * sum;
 }
 
+/* Do all parts of a pass; returns 1 where one failed. */
+static int together(state *s, eg_part *part, ptrdiff_t count)
+{
+    int failed = 0;
+    if (s->options->share && count > 1)
+        s->options->share(part, s, count);
+    else
+        for (ptrdiff_t k = 0; k < count; ++k)
+            part(s, k);
+    for (ptrdiff_t k = 0; k < count; ++k)
+        failed |= s->statuses[k] != 0.0;
+    return failed;
+}
+
+/* A pass over observations, in parts of so many; one over pairs of observations of a point. */
+static void pass(state *s, eg_part *part)
+{
+    s->failed |= together(s, part, s->options->n_passes);
+}
+
+/* Add up what the parts of a pass have summed, each at its own place. */
+static void add_parts(ptrdiff_t parts, ptrdiff_t size, double *sums)
+{
+    for (ptrdiff_t k = 1; k < parts; ++k)
+        eg_add(size, sums + k * size, sums);
+}
+
+static void cost_part(void *self, ptrdiff_t k)
+{
+    state *s = self;
+    const ptrdiff_t *edge = s->options->passes + k;
+    s->statuses[k] = eg_bundle_costs(s->bundle, edge[0], edge[1], s->cameras, s->points, s->costs);
+}
+
 static double cost_at_start(void *self)
 {
     state *s = self;
-    s->failed |= eg_bundle_costs(s->bundle, 0, s->bundle->n_chunks, s->cameras, s->points, s->costs);
+    pass(s, cost_part);
     return total(s, s->costs);
 }
 
@@ -82,13 +117,22 @@ static double mean_diagonal(ptrdiff_t count, ptrdiff_t size, const double *block
     return most;
 }
 
+static void linearize_part(void *self, ptrdiff_t k)
+{
+    state *s = self;
+    const ptrdiff_t *edge = s->options->passes + k, size = s->n * s->route.camera_sums;
+    double *sums = s->sums + k * size;
+    memset(sums, 0, (size_t)size * sizeof(double));
+    s->statuses[k] = eg_bundle_linearize(s->bundle, edge[0], edge[1], s->cameras, s->points, s->V,
+                                         s->D_points, s->g_points, sums);
+}
+
 static eg_lm_system linearize(void *self)
 {
     state *s = self;
     eg_lm_system system = {0.0, 0.0, INFINITY};
-    memset(s->sums, 0, (size_t)(s->n * s->route.camera_sums) * sizeof(double));
-    s->failed |= eg_bundle_linearize(s->bundle, 0, s->bundle->n_chunks, s->cameras, s->points, s->V,
-                                     s->D_points, s->g_points, s->sums);
+    pass(s, linearize_part);
+    add_parts(s->options->n_passes, s->n * s->route.camera_sums, s->sums);
     eg_bundle_camera_blocks(s->bundle, s->sums, s->U, s->D, s->g);
     for (ptrdiff_t k = 0; k < s->n * s->d; ++k)
         system.steepest = fmax(system.steepest, fabs(s->g[k]));
@@ -143,26 +187,41 @@ static void retract(state *s)
             s->trial_cameras[c * i + k] = to[n * k + i];
 }
 
-static int make_step(void *self, double lam, double *norm)
+/* Inverse roots of the damped blocks of points. */
+static void roots_part(void *self, ptrdiff_t k)
 {
     state *s = self;
-    const ptrdiff_t n = s->n, m = s->m, d = s->d, b = s->b, chunks = s->bundle->n_chunks;
-    const ptrdiff_t count = s->views->slot[n], width = s->route.factored ? b * b : 1;
-    double *reduced = s->x;
-    if (s->failed)
-        return EG_STEP_HOPELESS;
-    if (whiten(s, lam) || eg_bundle_inverse_roots(m, b, s->V, s->D_points, width, lam, s->g_points,
-                                                  s->T, s->half))
-        return EG_STEP_SINGULAR;
-    memset(s->pairs, 0, (size_t)(count * s->route.pair_sums) * sizeof(double));
-    memset(reduced, 0, (size_t)(12 * s->panels->n) * sizeof(double));
-    memset(s->coupled, 0, (size_t)(n * d) * sizeof(double));
-    s->failed |= eg_bundle_schur(s->bundle, 0, chunks, s->cameras, s->points, s->T, s->half, s->views,
-                                 s->pairs, s->coupled);
-    for (ptrdiff_t i = 0; i < n; ++i)
-        for (ptrdiff_t k = 0; k < d; ++k)
-            for (ptrdiff_t l = 0; l < d; ++l)
-                reduced[d * i + k] += s->A[d * (d * i + l) + k] * (s->coupled[d * i + l] - s->g[d * i + l]);
+    const ptrdiff_t parts = s->options->n_passes, b = s->b, width = s->route.factored ? b * b : 1;
+    const ptrdiff_t begin = s->m * k / parts, end = s->m * (k + 1) / parts;
+    s->statuses[k] = eg_bundle_inverse_roots(
+        end - begin, b, s->V + b * b * begin, s->D_points + width * begin, width, s->lam,
+        s->g_points + b * begin, s->T + b * b * begin, s->half + b * begin);
+}
+
+static void schur_part(void *self, ptrdiff_t k)
+{
+    state *s = self;
+    const ptrdiff_t *edge = s->options->pairs + k, unknowns = s->n * s->d;
+    const ptrdiff_t size = s->views->slot[s->n] * s->route.pair_sums;
+    double *pairs = s->pairs + k * size, *coupled = s->coupled_cameras + k * unknowns;
+    memset(pairs, 0, (size_t)size * sizeof(double));
+    memset(coupled, 0, (size_t)unknowns * sizeof(double));
+    s->statuses[k] = eg_bundle_schur(s->bundle, edge[0], edge[1], s->cameras, s->points, s->T,
+                                     s->half, s->views, pairs, coupled);
+}
+
+static void couple_part(void *self, ptrdiff_t k)
+{
+    state *s = self;
+    const ptrdiff_t *edge = s->options->passes + k;
+    s->statuses[k] = eg_bundle_couple(s->bundle, edge[0], edge[1], s->cameras, s->points, s->T,
+                                      s->step, 0, s->coupled, 0);
+}
+
+/* The reduced system of the whitened unknowns of the cameras, and its factor. */
+static int reduce(state *s)
+{
+    const ptrdiff_t n = s->n, d = s->d, count = s->views->slot[n];
     const double *blocks = s->pairs;
     ptrdiff_t size = s->route.pair_sums, length = s->route.padded;
     if (s->route.factored) {
@@ -172,20 +231,49 @@ static int make_step(void *self, double lam, double *norm)
         length = d;
     }
     eg_skyline_reduce(s->views, s->panels, d, d, blocks, size, length, s->white, s->A, s->S);
-    if (eg_envelope_factor(s->panels, s->S))
-        return EG_STEP_SINGULAR;
-    eg_envelope_solve(s->panels, s->S, 1, reduced);
-    double sum = 0.0;
+    return eg_envelope_factor(s->panels, s->S);
+}
+
+/* The step of the cameras, from the factor; returns its squared length. */
+static double step_of_cameras(state *s)
+{
+    const ptrdiff_t n = s->n, d = s->d;
+    double sum = 0.0, *x = s->x;
+    memset(x, 0, (size_t)(12 * s->panels->n) * sizeof(double));
+    for (ptrdiff_t i = 0; i < n; ++i)
+        for (ptrdiff_t k = 0; k < d; ++k)
+            for (ptrdiff_t l = 0; l < d; ++l)
+                x[d * i + k] += s->A[d * (d * i + l) + k]
+                                * (s->coupled_cameras[d * i + l] - s->g[d * i + l]);
+    eg_envelope_solve(s->panels, s->S, 1, x);
     for (ptrdiff_t i = 0; i < n; ++i)
         for (ptrdiff_t k = 0; k < d; ++k) {
             double value = 0.0;
             for (ptrdiff_t l = 0; l < d; ++l)
-                value += s->A[d * (d * i + k) + l] * reduced[d * i + l];
+                value += s->A[d * (d * i + k) + l] * x[d * i + l];
             s->step[d * i + k] = value;
             sum += value * value;
         }
-    s->failed |= eg_bundle_couple(s->bundle, 0, chunks, s->cameras, s->points, s->T, s->step, 0,
-                                  s->coupled, 0);
+    return sum;
+}
+
+static int make_step(void *self, double lam, double *norm)
+{
+    state *s = self;
+    const ptrdiff_t n = s->n, m = s->m, d = s->d, b = s->b, parts = s->options->n_pairs;
+    const volatile int *stop = s->options->stop;
+    if (s->failed || (stop && *stop))
+        return EG_STEP_HOPELESS;
+    s->lam = lam;
+    if (whiten(s, lam) || together(s, roots_part, s->options->n_passes))
+        return EG_STEP_SINGULAR;
+    s->failed |= together(s, schur_part, parts);
+    add_parts(parts, s->views->slot[n] * s->route.pair_sums, s->pairs);
+    add_parts(parts, n * d, s->coupled_cameras);
+    if (reduce(s))
+        return EG_STEP_SINGULAR;
+    double sum = step_of_cameras(s);
+    pass(s, couple_part);
     eg_bundle_point_steps(m, b, s->T, s->half, s->coupled, 0, 0, s->point_step);
     for (ptrdiff_t k = 0; k < m * b; ++k) {
         sum += s->point_step[k] * s->point_step[k];
@@ -196,12 +284,20 @@ static int make_step(void *self, double lam, double *norm)
     return s->failed ? EG_STEP_HOPELESS : EG_STEP_MADE;
 }
 
+static void refine_part(void *self, ptrdiff_t k)
+{
+    state *s = self;
+    const ptrdiff_t *edge = s->options->passes + k;
+    s->statuses[k] = eg_bundle_refine_points(s->bundle, edge[0], edge[1], s->trial_cameras,
+                                             s->trial_points, s->costs, 0,
+                                             &s->options->refinement);
+}
+
 static double cost_at_trial(void *self)
 {
     state *s = self;
     const eg_bundle_options *o = s->options;
-    s->failed |= eg_bundle_refine_points(s->bundle, 0, s->bundle->n_chunks, s->trial_cameras,
-                                         s->trial_points, s->costs, 0, &o->refinement);
+    pass(s, refine_part);
     for (ptrdiff_t i = 0; i < s->n; ++i)
         for (ptrdiff_t k = 0; k < o->focals; ++k) {
             const double focal = s->trial_cameras[s->route.camera * i + o->focal[k]];
@@ -223,23 +319,24 @@ static void accept(void *self)
    memory. */
 int eg_bundle_minimize(
     const eg_bundle *bundle, const eg_envelope *views, const eg_envelope *panels,
-    const eg_bundle_options *options, double *cameras, double *points, double *history, double *cost,
-    ptrdiff_t *counts)
+    const eg_bundle_options *options, double *cameras, double *points,
+    const eg_bundle_normal *normal, double *history, double *cost, ptrdiff_t *counts)
 {
     state s = {.bundle = bundle, .views = views, .panels = panels, .options = options,
                .route = eg_route_of(bundle), .n = bundle->n_views, .m = bundle->n_points,
-               .cameras = cameras, .points = points};
+               .cameras = cameras, .points = points, .U = normal->U, .V = normal->V,
+               .g = normal->g, .g_points = normal->g_points};
     const ptrdiff_t n = s.n, m = s.m, d = s.d = s.route.tangent, b = s.b = s.route.point;
     const ptrdiff_t count = views->slot[n], c = s.route.camera;
-    const ptrdiff_t larger = m * b > n * d ? m * b : n * d;
+    const ptrdiff_t passes = options->n_passes, pairs = options->n_pairs;
     const struct { double **part; ptrdiff_t size; } parts[] = {
-        {&s.trial_cameras, n * c}, {&s.trial_points, m * b}, {&s.costs, m}, {&s.U, n * d * d},
-        {&s.V, m * b * b}, {&s.D, n * d * d}, {&s.g, n * d}, {&s.g_points, m * b},
-        {&s.D_points, m * b * b}, {&s.sums, n * s.route.camera_sums},
-        {&s.pairs, count * s.route.pair_sums}, {&s.blocks, s.route.factored ? count * d * d : 0},
-        {&s.A, n * d * d}, {&s.white, n * d * d}, {&s.S, 144 * panels->slot[panels->n]},
-        {&s.x, 12 * panels->n}, {&s.step, n * d}, {&s.T, m * b * b}, {&s.half, m * b},
-        {&s.coupled, larger}, {&s.point_step, m * b}, {&s.lanes, n * (2 * c + EG_MOST_TANGENT)},
+        {&s.statuses, passes > pairs ? passes : pairs}, {&s.trial_cameras, n * c},
+        {&s.trial_points, m * b}, {&s.costs, m}, {&s.D, n * d * d}, {&s.D_points, m * b * b},
+        {&s.sums, passes * n * s.route.camera_sums}, {&s.pairs, pairs * count * s.route.pair_sums},
+        {&s.blocks, s.route.factored ? count * d * d : 0}, {&s.A, n * d * d},
+        {&s.white, n * d * d}, {&s.S, 144 * panels->slot[panels->n]}, {&s.x, 12 * panels->n},
+        {&s.step, n * d}, {&s.T, m * b * b}, {&s.half, m * b}, {&s.coupled_cameras, pairs * n * d},
+        {&s.coupled, m * b}, {&s.point_step, m * b}, {&s.lanes, n * (2 * c + EG_MOST_TANGENT)},
     };
     const size_t kinds = sizeof parts / sizeof parts[0];
     ptrdiff_t size = 8;

@@ -5,124 +5,104 @@
 #include "bundle_moments.h"
 #include "bundle_pairs.h"
 
-/* Where the sums of a pair of views are; NULL outside the envelope. */
-static inline double *eg_pair_of(const eg_envelope *envelope, ptrdiff_t size, int32_t row,
-                                 int32_t column, double *pairs)
+/* The observations of a group view by view. Returns the lowest view, and the highest by its
+   address; `end` becomes the end of each view's. */
+static inline int32_t eg_sort_by_view(eg_group *group, int32_t *highest)
 {
-    const int32_t first = envelope->first[row];
-    return column < first ? 0 : pairs + size * (envelope->slot[row] + column - first);
-}
-
-/* The observations of a chunk view by view, entry L j + s for slot s of lane j; `end` has an entry a
-   view and one more. Returns the lowest view, and the highest by its address. */
-static inline int32_t eg_sort_by_view(const eg_chunk *chunk, ptrdiff_t *EG_RESTRICT end,
-                                      int32_t *EG_RESTRICT sorted, int32_t *highest)
-{
-    const ptrdiff_t M = chunk->M, L = chunk->L, lanes = eg_filled(chunk, 0, M);
-    int32_t low = chunk->view[0], high = low;
-    for (ptrdiff_t j = 0; j < lanes; ++j) {
-        const int32_t first = chunk->view[j], last = chunk->view[(chunk->count[j] - 1) * M + j];
-        low = first < low ? first : low;
-        high = last > high ? last : high;
+    const int32_t *EG_RESTRICT view = group->view;
+    int32_t *EG_RESTRICT end = group->end, *EG_RESTRICT sorted = group->sorted;
+    int32_t low = view[0], high = low;
+    for (ptrdiff_t r = 0; r < group->count; ++r) {
+        low = view[r] < low ? view[r] : low;
+        high = view[r] > high ? view[r] : high;
     }
-    for (ptrdiff_t v = low; v <= high + 1; ++v)
-        end[v] = 0;
-    for (ptrdiff_t j = 0; j < lanes; ++j)
-        for (ptrdiff_t s = 0; s < chunk->count[j]; ++s)
-            ++end[chunk->view[s * M + j] + 1];
+    memset(end + low, 0, (size_t)(high + 2 - low) * sizeof *end);
+    for (ptrdiff_t r = 0; r < group->count; ++r)
+        ++end[view[r] + 1];
     for (ptrdiff_t v = low; v <= high; ++v)
         end[v + 1] += end[v];
-    for (ptrdiff_t j = 0; j < lanes; ++j)
-        for (ptrdiff_t s = 0; s < chunk->count[j]; ++s)
-            sorted[end[chunk->view[s * M + j]]++] = (int32_t)(L * j + s);
+    for (ptrdiff_t r = 0; r < group->count; ++r)
+        sorted[end[view[r]]++] = (int32_t)r;
     *highest = high;
     return low;
-}
-
-/* Whether an observation is a repetition: of the same point in the same view as the one before. */
-static inline int eg_repeated(const eg_chunk *chunk, ptrdiff_t s, ptrdiff_t j)
-{
-    return s > 0 && chunk->view[s * chunk->M + j] == chunk->view[(s - 1) * chunk->M + j];
 }
 
 /* Most lanes whose pairs are added at once; most doubles that are prepared of an observation. */
 #define EG_RUN 8
 #define EG_MOST_PREPARED 16
 
-/* Lanes from the next of the sorted observations on that are neighbours, and are seen by the same
-   views up to that of slot t; at most so many. */
-static inline ptrdiff_t eg_run_of_lanes(const eg_chunk *chunk, const int32_t *sorted, ptrdiff_t left,
-                                        ptrdiff_t t, ptrdiff_t most)
+/* Observations from the next of the sorted ones on that are equally far from one another, and whose
+   points are seen by the same views before; at most so many. */
+static inline ptrdiff_t eg_run_of_lanes(const eg_group *group, const int32_t *sorted, ptrdiff_t left,
+                                        ptrdiff_t before, ptrdiff_t most)
 {
-    const ptrdiff_t M = chunk->M, L = chunk->L, j = sorted[0] / L;
+    const ptrdiff_t step = left > 1 ? sorted[1] - sorted[0] : 0;
+    const int32_t *view = group->view + sorted[0];
     ptrdiff_t run = 1;
-    for (; run < most && run < left && sorted[run] == sorted[0] + L * run; ++run)
-        for (ptrdiff_t s = 0; s < t; ++s)
-            if (chunk->view[s * M + j + run] != chunk->view[s * M + j])
+    for (; run < most && run < left && sorted[run] == sorted[0] + step * run; ++run) {
+        const ptrdiff_t r = sorted[run];
+        if (r - group->first[group->lane[r]] != before)
+            return run;
+        for (ptrdiff_t s = 1; s <= before; ++s)
+            if (view[step * run - s] != view[-s])
                 return run;
+    }
     return run;
 }
 
-/* Add to the pairs of any chunk, row by row of the envelope, so that the sums of a row stay in the
-   fast cache meanwhile. `turned` holds `size` doubles of each observation; `add` adds those of slots
-   s and t of a run of up to `most` lanes, t's as `prepare` (unless NULL) has made them. */
+/* Add to the pairs of a group, row by row of the envelope, so that the sums of a row stay in the fast
+   cache meanwhile. `add` adds those of two observations of a run of up to `most` points, the second
+   ones as `prepare` (unless NULL) has made them. */
 EG_INLINE void eg_add_by_view(
-    const eg_pass *p, const eg_envelope *envelope, ptrdiff_t size, ptrdiff_t most,
-    const double *turned, ptrdiff_t *end, int32_t *sorted, double *pairs,
-    void (*prepare)(const double *, double *),
+    const eg_route *route, const eg_envelope *envelope, eg_group *group, ptrdiff_t size,
+    ptrdiff_t most, double *pairs, void (*prepare)(const double *, double *),
     void (*add)(const eg_route *, ptrdiff_t, ptrdiff_t, const double *, const double *,
                 const double *, double *))
 {
-    const eg_chunk *chunk = &p->chunk;
-    const ptrdiff_t M = chunk->M, L = chunk->L, sums = p->route->pair_sums, stride = size * L;
-    int32_t high, row = eg_sort_by_view(chunk, end, sorted, &high);
-    for (ptrdiff_t next = 0, run; row <= high; ++row)
-        for (; next < end[row]; next += run) {
-            const ptrdiff_t j = sorted[next] / L, t = sorted[next] % L;
-            const double *own = turned + stride * j;
-            const double *across = own + size * t;
+    if (!group->count)
+        return;
+    const ptrdiff_t sums = route->pair_sums;
+    const double *turned = group->turned;
+    int32_t high, row = eg_sort_by_view(group, &high);
+    for (ptrdiff_t next = 0, run; row <= high; ++row) {
+        const int32_t lowest = envelope->first[row];
+        double *sums_of_row = pairs + sums * (envelope->slot[row] - lowest);
+        for (; next < group->end[row]; next += run) {
+            const int32_t *sorted = group->sorted + next;
+            const ptrdiff_t left = group->end[row] - next, t = sorted[0];
+            const ptrdiff_t lane = group->lane[t], first = group->first[lane];
+            const double *across = turned + size * t, *moments = group->moments + 16 * lane;
             double kept[EG_MOST_PREPARED];
-            run = eg_run_of_lanes(chunk, sorted + next, end[row] - next, t, most);
+            run = eg_run_of_lanes(group, sorted, left, t - first, most);
+            const ptrdiff_t stride = run > 1 ? size * (sorted[1] - t) : 0;
             if (prepare) {
                 prepare(across, kept);
                 across = kept;
             }
-            for (ptrdiff_t s = 0; s <= t; ++s) {
-                double *sum = eg_pair_of(envelope, sums, row, chunk->view[s * M + j], pairs);
-                if (!sum)
+            for (ptrdiff_t s = first; s <= t; ++s) {
+                const int32_t column = group->view[s];
+                if (column < lowest)
                     continue;
-                add(p->route, run, stride, own + size * s, across, p->moments + 16 * j, sum);
+                double *sum = sums_of_row + sums * column;
+                add(route, run, stride, turned + size * s, across, moments, sum);
                 /* A repetition stands for both orders. */
-                for (ptrdiff_t k = 0; s < t && chunk->view[s * M + j] == row && k < run; ++k) {
-                    const double *first = own + stride * k + size * s, *second = first + size * (t - s);
-                    double turned_first[EG_MOST_PREPARED];
+                for (ptrdiff_t k = 0; s < t && column == row && k < run; ++k) {
+                    const double *own = turned + size * s + stride * k;
+                    double turned_own[EG_MOST_PREPARED];
                     if (prepare)
-                        prepare(first, turned_first);
-                    add(p->route, 1, stride, second, prepare ? turned_first : first,
-                        p->moments + 16 * (j + k), sum);
+                        prepare(own, turned_own);
+                    add(route, 1, 0, own + size * (t - s), prepare ? turned_own : own, moments, sum);
                 }
             }
         }
+    }
 }
 
 /* ---------------------------------------------------------------- the factored route */
 
-/* Lanes that hold a point, where all of these are seen by the same views, once; else 0. */
-static ptrdiff_t alike(const eg_chunk *chunk)
-{
-    const ptrdiff_t M = chunk->M, lanes = eg_filled(chunk, 0, M);
-    if (chunk->count[lanes - 1] < chunk->count[0])
-        return 0;
-    for (ptrdiff_t s = 0; s < chunk->L; ++s)
-        if (eg_run(chunk->view + s * M, 0, lanes) < lanes || eg_repeated(chunk, s, 0))
-            return 0;
-    return lanes;
-}
-
-/* Add to the pairs of a chunk whose points are seen by the same views: pair by pair, the factors
-   F_s F_t^T of all points at once (in work), the sums in registers. */
-static void add_alike(const eg_pass *p, const eg_envelope *envelope, ptrdiff_t lanes,
-                      const double *F, double *pairs)
+/* Pair by pair, the factors F_s F_t^T of all points at once (in work), the sums in registers. */
+void eg_factored_pairs_alike(const eg_pass *p, const eg_envelope *envelope, ptrdiff_t lanes,
+                             const double *F, double *pairs)
 {
     const eg_chunk *chunk = &p->chunk;
     const ptrdiff_t M = chunk->M;
@@ -130,8 +110,11 @@ static void add_alike(const eg_pass *p, const eg_envelope *envelope, ptrdiff_t l
     for (ptrdiff_t t = 0; t < chunk->L; ++t)
         for (ptrdiff_t s = 0; s <= t; ++s) {
             const double *Fs = F + 12 * s * M, *Ft = F + 12 * t * M;
-            double *sum = eg_pair_of(envelope, EG_PAIR, chunk->view[t * M], chunk->view[s * M], pairs);
-            for (int a = 0; sum && a < 3; ++a)
+            const int32_t row = chunk->view[t * M], column = chunk->view[s * M];
+            if (column < envelope->first[row])
+                continue;
+            double *sum = pairs + EG_PAIR * (envelope->slot[row] + column - envelope->first[row]);
+            for (int a = 0; a < 3; ++a)
                 for (int b = 0; b < 3; ++b) {
                     EG_SIMD
                     for (ptrdiff_t j = 0; j < M; ++j)
@@ -141,7 +124,7 @@ static void add_alike(const eg_pass *p, const eg_envelope *envelope, ptrdiff_t l
                             + Fs[(4 * a + 2) * M + j] * Ft[(4 * b + 2) * M + j]
                             + Fs[(4 * a + 3) * M + j] * Ft[(4 * b + 3) * M + j];
                 }
-            for (int e = 0; sum && e < 9; e += 3)
+            for (int e = 0; e < 9; e += 3)
                 eg_accumulate(lanes, X + e * M, M, p->moments, sum + 8 * e, sum + 9 * 8 + 4 * e);
         }
 }
@@ -175,43 +158,84 @@ EG_INLINE void add_pair(const eg_route *route, ptrdiff_t run, ptrdiff_t stride,
 
 /* (F_s F_t^T) x Q Q^T: nine rows of moments a pair, row (a, b) for row a of the view with the lower
    number. */
-void eg_factored_pairs(const eg_pass *p, const eg_envelope *envelope, const double *F,
-                       double *EG_RESTRICT turned, ptrdiff_t *views, int32_t *sorted, double *sums)
+void eg_factored_pairs(const eg_route *route, const eg_envelope *envelope, eg_group *group,
+                       double *pairs)
 {
-    const eg_chunk *chunk = &p->chunk;
-    const ptrdiff_t M = chunk->M, L = chunk->L, lanes = alike(chunk);
-    if (lanes) {
-        add_alike(p, envelope, lanes, F, sums);
-        return;
-    }
-    for (ptrdiff_t s = 0; s < L; ++s)
-        for (ptrdiff_t j = 0; j < M && s < chunk->count[j]; ++j)
-            for (ptrdiff_t k = 0; k < 12; ++k)
-                turned[12 * (L * j + s) + k] = F[(12 * s + k) * M + j];
-    eg_add_by_view(p, envelope, 12, 1, turned, views, sorted, sums, turn, add_pair);
+    eg_add_by_view(route, envelope, group, 12, 1, pairs, turn, add_pair);
 }
 
 /* ---------------------------------------------------------------- the direct route */
 
-/* Y = J^T Z of every observation of a chunk, turned: b rows of the padded width. */
-EG_INLINE void turn_direct(const eg_pass *p, ptrdiff_t padded, ptrdiff_t b, const double *F,
-                        double *EG_RESTRICT turned)
+/* Jacobians J (2, tangent of the model) of a slot, lane by lane: rows of the padded width of both
+   coordinates, filled up with zeros. Returns where they are, behind all else in `work`. */
+EG_INLINE double *turn_cameras(const eg_pass *p, ptrdiff_t padded, const double *J)
 {
-    const eg_chunk *chunk = &p->chunk;
-    const ptrdiff_t M = chunk->M, L = chunk->L, d = eg_model_of(p)->tangent_size;
-    for (ptrdiff_t s = 0; s < L; ++s, F += p->route->factors * M) {
-        const double *Z = F + 2 * d * M;
-        for (ptrdiff_t j = 0; j < M && s < chunk->count[j]; ++j) {
-            double first[EG_MOST_TANGENT], second[EG_MOST_TANGENT];
-            double *EG_RESTRICT Y = turned + padded * b * (L * j + s);
-            eg_turn_camera(p, padded, F, j, first, second);
-            for (ptrdiff_t k = 0; k < b; ++k) {
-                const double x = Z[k * M + j], y = Z[(b + k) * M + j];
+    const ptrdiff_t M = p->chunk.M, K = p->route->tangent, d = eg_model_of(p)->tangent_size;
+    const int32_t *column = p->bundle->columns;
+    double *turned = p->work + (p->route->work - 2 * padded) * M;
+    const double *row[2 * EG_MOST_TANGENT];
+    memset(p->loss, 0, (size_t)M * sizeof(double)); /* not needed any more */
+    for (ptrdiff_t k = 0; k < padded; ++k) {
+        row[k] = k < K ? J + column[k] * M : p->loss;
+        row[padded + k] = k < K ? J + (d + column[k]) * M : p->loss;
+    }
+    for (ptrdiff_t k = 0; k < 2 * padded; k += 4) {
+        const double *EG_RESTRICT x = row[k], *EG_RESTRICT y = row[k + 1];
+        const double *EG_RESTRICT z = row[k + 2], *EG_RESTRICT w = row[k + 3];
+        double *EG_RESTRICT to = turned + k;
+        for (ptrdiff_t j = 0; j < p->filled; ++j, to += 2 * padded)
+            to[0] = x[j], to[1] = y[j], to[2] = z[j], to[3] = w[j];
+    }
+    return turned;
+}
+
+/* Sums of the cameras of a slot, K rows of the upper triangle of J^T J, from the multiple of four
+   before the diagonal on, and one of the gradient. */
+EG_INLINE void add_to_cameras(const eg_pass *p, ptrdiff_t padded, const double *r, const double *J,
+                              double *cameras)
+{
+    const ptrdiff_t M = p->chunk.M, K = p->route->tangent;
+    const double *first = turn_cameras(p, padded, J);
+    for (ptrdiff_t j = 0; j < p->filled; ++j, first += 2 * padded) {
+        const double *EG_RESTRICT x = first, *EG_RESTRICT y = first + padded;
+        double *EG_RESTRICT sum = cameras + p->route->camera_sums * p->view[j];
+        const double w = p->w[j], e = w * r[j], f = w * r[M + j];
+        for (ptrdiff_t begin = 0; begin < padded; begin += 4)
+            for (ptrdiff_t a = begin; a < begin + 4 && a < K; ++a) {
+                const double u = w * x[a], v = w * y[a];
                 EG_SIMD
-                for (ptrdiff_t c = 0; c < padded; ++c)
-                    Y[padded * k + c] = x * first[c] + y * second[c];
+                for (ptrdiff_t c = begin; c < padded; ++c)
+                    sum[padded * a + c] += u * x[c] + v * y[c];
             }
+        EG_SIMD
+        for (ptrdiff_t c = 0; c < padded; ++c)
+            sum[padded * K + c] -= e * x[c] + f * y[c];
+    }
+}
+
+/* Y = J^T Z of every observation of a slot, turned: b rows of the padded width; reduced += Y v. */
+EG_INLINE void turn_direct(const eg_pass *p, ptrdiff_t padded, ptrdiff_t b, const double *J,
+                           const double *Z, const double *v, const int32_t *begin, ptrdiff_t s,
+                           double *turned, double *reduced)
+{
+    const ptrdiff_t M = p->chunk.M;
+    const double *first = turn_cameras(p, padded, J);
+    for (ptrdiff_t j = 0; j < p->filled; ++j, first += 2 * padded) {
+        const double *EG_RESTRICT x = first, *EG_RESTRICT y = first + padded;
+        double *EG_RESTRICT Y = turned + padded * b * (begin[j] + s);
+        double *EG_RESTRICT sum = reduced + padded * p->view[j];
+        double e = 0.0, f = 0.0;
+        for (ptrdiff_t k = 0; k < b; ++k) {
+            const double u = Z[k * M + j], t = Z[(b + k) * M + j];
+            EG_SIMD
+            for (ptrdiff_t c = 0; c < padded; ++c)
+                Y[padded * k + c] = u * x[c] + t * y[c];
+            if (v)
+                e += u * v[k * M + j], f += t * v[k * M + j];
         }
+        EG_SIMD
+        for (ptrdiff_t c = 0; c < padded; ++c)
+            sum[c] += e * x[c] + f * y[c];
     }
 }
 
@@ -272,8 +296,8 @@ EG_INLINE void add_block(ptrdiff_t K, ptrdiff_t padded, ptrdiff_t b, ptrdiff_t r
             }
 }
 
-/* The loops over pairs, for points of three and four entries; W is the padded width. */
-#define PAIRS(NAME, W, B)                                                                          \
+/* The loops for points of B entries; W is the width of rows. */
+#define LOOPS(NAME, W, B)                                                                          \
     EG_INLINE void add_##NAME(const eg_route *route, ptrdiff_t run, ptrdiff_t stride,              \
                               const double *Ys, const double *Yt, const double *moments,           \
                               double *sum)                                                         \
@@ -281,23 +305,41 @@ EG_INLINE void add_block(ptrdiff_t K, ptrdiff_t padded, ptrdiff_t b, ptrdiff_t r
         (void)moments;                                                                             \
         add_block(route->tangent, W, B, run, stride, Ys, Yt, sum);                                 \
     }                                                                                              \
-    static void pairs_##NAME(const eg_pass *p, const eg_envelope *envelope, const double *F,       \
-                             double *turned, ptrdiff_t *views, int32_t *sorted, double *sums)      \
+    static void pairs_##NAME(const eg_route *route, const eg_envelope *envelope, eg_group *group,  \
+                             double *sums)                                                         \
     {                                                                                              \
-        turn_direct(p, W, B, F, turned);                                                                \
-        eg_add_by_view(p, envelope, (B) * (W), EG_RUN, turned, views, sorted, sums,                \
-                       NULL, add_##NAME);                                                          \
+        eg_add_by_view(route, envelope, group, (B) * (W), EG_RUN, sums, NULL, add_##NAME);         \
+    }                                                                                              \
+    static void turn_slot_##NAME(const eg_pass *p, const double *J, const double *Z,               \
+                                 const double *v, const int32_t *first, ptrdiff_t s,               \
+                                 eg_group *group, double *reduced)                                 \
+    {                                                                                              \
+        turn_direct(p, W, B, J, Z, v, first, s, group->turned, reduced);                           \
     }
-#define CASE(W) PAIRS(three_##W, W, 3) PAIRS(four_##W, W, 4)
-EG_WIDTHS(CASE)
-#undef CASE
 
-eg_pairs *eg_direct_pairs(ptrdiff_t padded, ptrdiff_t b)
+/* Those of a width, up to EG_MOST_TANGENT. */
+#define WIDTH(W)                                                                                   \
+    static void add_cameras_##W(const eg_pass *p, const double *r, const double *J,                \
+                                double *cameras)                                                   \
+    {                                                                                              \
+        add_to_cameras(p, W, r, J, cameras);                                                       \
+    }                                                                                              \
+    LOOPS(three_##W, W, 3) LOOPS(four_##W, W, 4)
+
+#define WIDTHS(CASE) CASE(8) CASE(12) CASE(16) CASE(20) CASE(24) CASE(32)
+WIDTHS(WIDTH)
+
+void eg_direct_loops(eg_route *route)
 {
-    switch (padded) {
-#define CASE(W) case W: return b == 3 ? pairs_three_##W : pairs_four_##W;
-        EG_WIDTHS(CASE)
+    const int three = route->point == 3;
+    switch (route->padded) {
+#define CASE(W)                                                                                    \
+    case W:                                                                                        \
+        route->add_cameras = add_cameras_##W;                                                      \
+        route->turn_slot = three ? turn_slot_three_##W : turn_slot_four_##W;                       \
+        route->pairs = three ? pairs_three_##W : pairs_four_##W;                                   \
+        break;
+        WIDTHS(CASE)
 #undef CASE
     }
-    return b == 3 ? pairs_three_32 : pairs_four_32;
 }

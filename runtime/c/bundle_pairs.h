@@ -2,37 +2,20 @@
 #ifndef EPIGAUGE_BUNDLE_PAIRS_H
 #define EPIGAUGE_BUNDLE_PAIRS_H
 
-#include "bundle_chunk.h"
-
-/* Widths of rows that the loops over pairs are compiled for, up to EG_MOST_TANGENT. */
-#define EG_WIDTHS(CASE) CASE(8) CASE(12) CASE(16) CASE(20) CASE(24) CASE(32)
+#include "bundle_group.h"
 
 static inline const eg_camera_model *eg_model_of(const eg_pass *p)
 {
     return eg_camera_models + p->bundle->model;
 }
 
-/* Rows of both coordinates of a lane's Jacobian J (2, tangent of the model), filled up with zeros. */
-EG_INLINE void eg_turn_camera(const eg_pass *p, ptrdiff_t padded, const double *J, ptrdiff_t j,
-                               double *EG_RESTRICT first, double *EG_RESTRICT second)
-{
-    const ptrdiff_t M = p->chunk.M, K = p->route->tangent, d = eg_model_of(p)->tangent_size;
-    const int32_t *column = p->bundle->columns;
-    for (ptrdiff_t k = 0; k < K; ++k) {
-        first[k] = J[column[k] * M + j];
-        second[k] = J[(d + column[k]) * M + j];
-    }
-    for (ptrdiff_t k = K; k < padded; ++k)
-        first[k] = second[k] = 0.0;
-}
+/* In bundle_pairs.c: `pairs` of the factored route, and of a chunk all of whose lanes, so many, are
+   seen by the same views; its factors are F. */
+void eg_factored_pairs(const eg_route *, const eg_envelope *, eg_group *, double *pairs);
+void eg_factored_pairs_alike(const eg_pass *, const eg_envelope *, ptrdiff_t lanes, const double *F,
+                             double *pairs);
 
-/* A function `pairs` of a route, see eg_route. */
-typedef void eg_pairs(const eg_pass *, const eg_envelope *, const double *, double *, ptrdiff_t *,
-                      int32_t *, double *);
-
-/* In bundle_pairs.c: of the factored route, and of the direct one for a width of rows and points of
-   b entries. */
-eg_pairs eg_factored_pairs;
-eg_pairs *eg_direct_pairs(ptrdiff_t padded, ptrdiff_t b);
+/* Fill in `add_cameras`, `turn_slot` and `pairs` of the direct route for its width. */
+void eg_direct_loops(eg_route *route);
 
 #endif

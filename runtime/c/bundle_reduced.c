@@ -42,7 +42,8 @@ void eg_bundle_camera_blocks(
     for (ptrdiff_t i = 0; i < bundle->n_views; ++i) {
         const double *sum = cameras + route.camera_sums * i;
         for (ptrdiff_t k = 0; k < a; ++k)
-            memcpy(U + a * (a * i + k), sum + route.padded * k, (size_t)a * sizeof(double));
+            for (ptrdiff_t l = k; l < a; ++l)
+                U[a * (a * i + k) + l] = U[a * (a * i + l) + k] = sum[route.padded * k + l];
         memcpy(g + a * i, sum + route.padded * a, (size_t)a * sizeof(double));
     }
 }

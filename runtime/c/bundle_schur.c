@@ -1,5 +1,5 @@
 /* The coupling of cameras and points: Schur complement, products. */
-#include "bundle_chunk.h"
+#include "bundle_group.h"
 #include "bundle_points.h"
 
 /* Identity matrices, or those of the lanes' points, observation-last. */
@@ -15,27 +15,6 @@ static void gather_roots(const eg_chunk *chunk, ptrdiff_t b, const double *T,
             out[k * chunk->M + j] = k % (b + 1) ? 0.0 : 1.0;
 }
 
-/* Factors of the coupling for all slots of a chunk. */
-static void couplings(eg_pass *p, const double *cameras, const double *roots, double *F)
-{
-    const ptrdiff_t M = p->chunk.M;
-    if (p->route->factored)
-        eg_moments(M, p->points, p->moments);
-    for (ptrdiff_t s = 0; s < p->chunk.L; ++s) {
-        eg_pass_slot(p, s, cameras);
-        p->route->couple(p, roots, F + p->route->factors * s * M);
-    }
-}
-
-/* cameras += W T v, over all slots of a chunk. */
-static void to_cameras(eg_pass *p, const double *F, const double *v, double *cameras)
-{
-    for (ptrdiff_t s = 0; s < p->chunk.L; ++s) {
-        eg_pass_slot_of(p, s, p->cameras);
-        p->route->to_cameras(p, F + p->route->factors * s * p->chunk.M, v, cameras);
-    }
-}
-
 /* Add to the pairs of cameras what eliminating the points takes off them, W T T^T W^T; pairs outside
    the envelope are left out. Add W T half to the cameras. */
 int eg_bundle_schur(
@@ -44,29 +23,34 @@ int eg_bundle_schur(
     double *pairs, double *reduced)
 {
     const eg_route route = eg_route_of(bundle);
-    const ptrdiff_t b = route.point;
+    const ptrdiff_t b = route.point, n = bundle->n_views, K = route.tangent, wide = route.padded;
     eg_pass p;
-    ptrdiff_t *views = malloc(((size_t)bundle->n_views + 2) * sizeof *views);
-    const ptrdiff_t a_row = route.factors + route.turned + 1;
-    if (!views || eg_pass_begin(&p, bundle, &route, begin, end, b + b * b, a_row)) {
-        free(views);
+    eg_group group;
+    double *own = calloc((size_t)(n * wide), sizeof *own);
+    int failed = !own || eg_group_begin(&group, bundle, &route, begin, end);
+    if (failed || eg_pass_begin(&p, bundle, &route, begin, end, b + b * b, route.factors)) {
+        if (!failed)
+            eg_release(group.turned);
+        free(own);
         return 1;
     }
-    for (ptrdiff_t c = begin; c < end; ++c) {
-        eg_pass_chunk(&p, c, points);
-        const ptrdiff_t M = p.chunk.M, rows = M * p.chunk.L;
-        double *v = p.extra, *roots = v + b * M, *turned = roots + b * b * M;
-        double *F = turned + route.turned * rows;
-        int32_t *sorted = (int32_t *)(F + route.factors * rows);
-        gather_roots(&p.chunk, b, T, roots);
-        couplings(&p, cameras, roots, F);
-        if (half) {
-            eg_gather(M, b, half, p.chunk.point, v);
-            to_cameras(&p, F, v, reduced);
+    for (ptrdiff_t c = begin, last; c < end; c = last) {
+        eg_group_clear(&group);
+        for (last = eg_group_end(bundle, c, end, route.turned); c < last; ++c) {
+            eg_pass_chunk(&p, c, points);
+            double *v = p.extra, *roots = v + b * p.chunk.M;
+            gather_roots(&p.chunk, b, T, roots);
+            if (half)
+                eg_gather(p.chunk.M, b, half, p.chunk.point, v);
+            route.turn(&p, cameras, roots, half ? v : 0, envelope, &group, pairs, own);
         }
-        route.pairs(&p, envelope, F, turned, views, sorted, pairs);
+        route.pairs(&route, envelope, &group, pairs);
     }
-    free(views);
+    for (ptrdiff_t i = 0; i < n; ++i)
+        for (ptrdiff_t k = 0; k < K; ++k)
+            reduced[K * i + k] += own[wide * i + k];
+    free(own);
+    eg_release(group.turned);
     eg_release(p.memory);
     return 0;
 }
@@ -81,28 +65,30 @@ int eg_bundle_couple(
     const eg_route route = eg_route_of(bundle);
     const ptrdiff_t b = route.point, a = route.tangent;
     eg_pass p;
-    if (eg_pass_begin(&p, bundle, &route, begin, end, a + b + b * b, route.factors))
+    if (eg_pass_begin(&p, bundle, &route, begin, end, a + b + b * b, 0))
         return 1;
     for (ptrdiff_t c = begin; c < end; ++c) {
         eg_pass_chunk(&p, c, points);
         const ptrdiff_t M = p.chunk.M;
         double *v = p.extra, *roots = v + b * M, *gathered = roots + b * b * M;
-        double *F = gathered + a * M;
         gather_roots(&p.chunk, b, T, roots);
-        couplings(&p, cameras, roots, F);
+        if (route.factored)
+            eg_moments(M, p.points, p.moments);
         if (y)
             eg_gather(M, b, y, p.chunk.point, v);
         else
             memset(v, 0, (size_t)(b * M) * sizeof(double));
         for (ptrdiff_t s = 0; x && s < p.chunk.L; ++s) {
-            eg_gather(M, a, x, p.chunk.view + s * M, gathered);
-            eg_pass_slot_of(&p, s, p.cameras);
-            route.to_points(&p, F + route.factors * s * M, gathered, v);
+            eg_pass_slot(&p, s, cameras);
+            eg_gather(M, a, x, p.view, gathered);
+            route.to_points(&p, roots, gathered, v);
         }
         if (moved)
             eg_scatter(&p.chunk, b, v, moved);
-        if (reduced)
-            to_cameras(&p, F, v, reduced);
+        for (ptrdiff_t s = 0; reduced && s < p.chunk.L; ++s) {
+            eg_pass_slot(&p, s, cameras);
+            route.to_cameras(&p, roots, v, reduced);
+        }
     }
     eg_release(p.memory);
     return 0;

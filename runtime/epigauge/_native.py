@@ -25,7 +25,10 @@ __all__ = [
     "Bundle",
     "BundleOptions",
     "Envelope",
+    "NormalArrays",
+    "Part",
     "Refinement",
+    "Share",
     "aligned_zeros",
     "check_sizes",
     "checked",
@@ -88,6 +91,11 @@ class Refinement(ctypes.Structure):
     )
 
 
+#: The eg_part and the eg_share of bundle.h.
+Part = ctypes.CFUNCTYPE(None, _P, _N)
+Share = ctypes.CFUNCTYPE(None, _P, _P, _N)
+
+
 class BundleOptions(ctypes.Structure):
     """The eg_bundle_options of bundle.h."""
 
@@ -99,7 +107,20 @@ class BundleOptions(ctypes.Structure):
         ("focals", _N),
         ("min_focal", _D),
         ("max_focal", _D),
+        ("share", Share),
+        ("n_passes", _N),
+        ("n_pairs", _N),
+        ("passes", _P),
+        ("pairs", _P),
+        ("stop", _P),
     )
+
+
+class NormalArrays(ctypes.Structure):
+    """The eg_bundle_normal of bundle.h."""
+
+    _fields_ = tuple((name, _P) for name in ("U", "V", "g", "g_points"))
+
 
 
 #: The damping of a refinement: by the trace of a point's block, or by the block.
@@ -126,7 +147,7 @@ _TYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "bundle_distances": (_I, (*_RANGE, *[_P] * 4)),
     "spreading_basis": (_I, (_N, _P, _P)),
     "resect": (_I, (_N, _P, _P, _D, _D, _N, _P)),
-    "bundle_minimize": (_I, (_P,) * 9),
+    "bundle_minimize": (_I, (_P,) * 10),
     "envelope_factor": (_I, (_P, _P)),
     "envelope_solve": (None, (_P, _P, _N, _P)),
     "skyline_reduce": (None, (_P, _P, _N, _N, _P, _N, _N, _P, _P, _P)),
@@ -157,6 +178,7 @@ def _checked_library() -> ctypes.CDLL:
             "eg_envelope": Envelope,
             "eg_refinement": Refinement,
             "eg_bundle_options": BundleOptions,
+            "eg_bundle_normal": NormalArrays,
         }
     )
     return library()

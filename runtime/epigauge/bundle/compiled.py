@@ -1,35 +1,53 @@
-"""The same minimisation by the compiled loop, for problems so small that Python's share would rule.
+"""The same minimisation by the compiled loop: nothing of Python between the parts of a step.
 
 `lm.minimize` over a `BundleProblem` is the reference; tests compare both row by row. What the
 compiled loop does not know is left to it: callbacks, ties, priors, gauges, other dampings and
-schedules, threads.
+schedules, reduced systems too large to be factored.
 """
 
 from __future__ import annotations
 
 import ctypes
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import lm
 from epigauge._library import address
-from epigauge._native import BundleOptions, checked, function
+from epigauge._native import BundleOptions, NormalArrays, checked, function
 from epigauge.bundle.dampings import START, START_METRIC, Covariant
 from epigauge.bundle.freedom import Freedom
+from epigauge.bundle.linearizer import Normal
 from epigauge.bundle.native_linearizer import NativeLinearizer
 from epigauge.cameras import MAX_FOCAL, MIN_FOCAL
 
 if TYPE_CHECKING:
     from epigauge.bundle.problem import BundleProblem, Estimate
 
-__all__ = ["minimized"]
+__all__ = ["Minimum", "minimized"]
 
 Array = NDArray[np.float64]
 
-#: Most observations: with these, no run keeps Ctrl-C waiting for long.
-_MOST = 5000
+#: With so few observations, no run keeps Ctrl-C waiting for long.
+_QUICK = 5000
+
+
+class Minimum(NamedTuple):
+    """Where the compiled loop ended.
+
+    `normal` are the normal equations there, None where cameras go by their factors; `counts` are
+    nfev, njev, nit and status.
+    """
+
+    cameras: Array
+    points: Array
+    cost: float
+    normal: Normal | None
+    counts: tuple[int, int, int, int]
+    history: tuple[lm.Row, ...]
 
 
 def minimized(
@@ -40,28 +58,27 @@ def minimized(
     stopping: lm.Stopping,
     scale: float,
     lam_floor: float,
-) -> tuple[Array, Array, float, int, tuple[int, int, int, int], tuple[lm.Row, ...]] | None:
-    """Minimise as `lm.minimize` does; None where the compiled loop does not know all parts.
-
-    Returns
-    -------
-    tuple
-        Cameras, points, cost, accepted steps, (nfev, njev, nit, status), history.
-    """
+) -> Minimum | None:
+    """Minimise as `lm.minimize` does; None where the compiled loop does not know all parts."""
     own = problem.linearizer
     if not (isinstance(own, NativeLinearizer) and _known(problem, own, damping, schedule)):
         return None
     assert problem.refinement is not None
-    skyline, metric = own.skyline, problem.model.metric
+    skyline, (n, d), (m, b) = own.skyline, (own.skyline.n, own.width), start.points.shape
     cameras = own.layout.inward(start.cameras).copy()
-    points = np.array(start.points, order="C")
+    # In the order of the passes points are found faster.
+    order, lanes = own.layout.points, own.layout.lane_by_lane
+    points, bundle = start.points[order], own.layout.bundle(own.loss)
+    bundle.point = address(lanes)
     focal = np.array([12 + k for k in problem.model.focal], np.int32)
+    stop = ctypes.c_int(0)
+    passes, pairs = own.edges
     options = BundleOptions(
         own.refinement(problem.refinement),
         stopping.ftol,
         stopping.xtol,
         stopping.gtol,
-        START_METRIC if metric else START,
+        START_METRIC if problem.model.metric else START,
         lam_floor,
         problem.floor,
         stopping.max_iter,
@@ -69,26 +86,65 @@ def minimized(
         len(focal),
         MIN_FOCAL,
         MAX_FOCAL,
+        own.share,
+        len(passes) - 1,
+        len(pairs) - 1,
+        address(passes),
+        address(pairs),
+        ctypes.addressof(stop),
     )
+    blocks = np.empty((n, d, d)), np.empty((m, b, b)), np.empty((n, d)), np.empty((m, b))
+    normal = NormalArrays(*map(address, blocks))
     history = np.empty((stopping.max_iter + 1, len(lm.Row.__dataclass_fields__)))
     cost, counts = ctypes.c_double(), np.zeros(4, np.intp)
     panels = skyline.panels(own.width)
-    checked(
-        function("bundle_minimize")(
-            own.reference,
-            skyline.reference,
-            panels.reference,
-            ctypes.addressof(options),
-            *map(address, (cameras, points, history)),
-            ctypes.addressof(cost),
-            address(counts),
+
+    def run() -> int:
+        return int(
+            function("bundle_minimize")(
+                ctypes.byref(bundle),
+                skyline.reference,
+                panels.reference,
+                ctypes.addressof(options),
+                *map(address, (cameras, points)),
+                ctypes.addressof(normal),
+                address(history),
+                ctypes.addressof(cost),
+                address(counts),
+            )
         )
-    )
+
+    quick = len(own.graph.point) <= _QUICK
+    checked(run() if quick else _interruptible(run, stop))
     nfev, njev, nit, status = counts.tolist()
     rows = lm.rows(history[:nfev], scale)
-    steps = sum(row.accepted for row in rows) - 1
-    found = own.layout.outward(cameras)
-    return found, points, cost.value, steps, (nfev, njev, nit, status), rows
+    U, g_cameras = blocks[0], blocks[2]
+    points, V, g_points = (_put(order, array) for array in (points, blocks[1], blocks[3]))
+    return Minimum(
+        own.layout.outward(cameras),
+        points,
+        cost.value,
+        None if own.factored else own.normal(cameras, points, U, V, g_cameras, g_points),
+        (nfev, njev, nit, status),
+        rows,
+    )
+
+
+def _put(order: NDArray[np.intp], rows: Array) -> Array:
+    result = np.empty_like(rows)
+    result[order] = rows
+    return result
+
+
+def _interruptible(run: Callable[[], int], stop: ctypes.c_int) -> int:
+    """Return what `run` does in a thread of its own; Ctrl-C sets `stop` and waits for its end."""
+    with ThreadPoolExecutor(1) as pool:  # leaving it waits
+        pending = pool.submit(run)
+        try:
+            return pending.result()
+        except BaseException:
+            stop.value = 1
+            raise
 
 
 def _known(problem: BundleProblem, own: NativeLinearizer, damping: Any, schedule: Any) -> bool:
@@ -107,6 +163,4 @@ def _known(problem: BundleProblem, own: NativeLinearizer, damping: Any, schedule
         and type(schedule) is lm.Classic
         and schedule.factor == lm.Classic().factor
         and own.direct
-        and own.alone
-        and len(own.graph.point) <= _MOST
     )

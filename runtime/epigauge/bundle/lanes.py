@@ -54,6 +54,8 @@ class LaneLayout:
     ----------
     lanes, rows : ndarray of int
         Where the lanes and the observations of each chunk begin.
+    points : ndarray of int, shape (m,)
+        The points lane by lane; lanes that fill up repeat the last.
     order : ndarray of int, shape (n,), or None
         Numbers of the cameras in the order of the skyline; None where it is their own.
     """
@@ -68,7 +70,7 @@ class LaneLayout:
     ) -> None:
         self._graph, self._q, self._weights, self.columns = graph, q, weights, columns
         counts = np.diff(graph.first)
-        points = _together(graph, counts)
+        self.points = points = _together(graph, counts)
         self.lanes, self.rows = _chunks(counts[points])
         filling, rows = self.lanes[-1] - len(points), self.rows[-1]
         self._point = np.concatenate([points, np.full(filling, points[-1])]).astype(np.int32)
@@ -94,6 +96,11 @@ class LaneLayout:
         made = Bundle.from_buffer_copy(self._bundle)
         made.scale2, made.loss = loss.scale**2, LOSSES.index(loss.name)
         return made
+
+    @property
+    def lane_by_lane(self) -> NDArray[np.int32]:
+        """Return the point of each lane where the points themselves are in the order of lanes."""
+        return np.minimum(np.arange(self.lanes[-1]), len(self.points) - 1).astype(np.int32)
 
     def shares(self, count: int) -> tuple[list[Range], list[Range]]:
         """Split the chunks into at most so many ranges of about equal work.

@@ -11,7 +11,7 @@ import copy
 import ctypes
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -24,7 +24,9 @@ from epigauge._native import (
     FACTORED,
     MOST_TANGENT,
     TRACE,
+    Part,
     Refinement,
+    Share,
     aligned_zeros,
     checked,
     function,
@@ -110,9 +112,22 @@ class NativeLinearizer:
         self._pool = ThreadPoolExecutor(others) if others else None
 
     @property
-    def alone(self) -> bool:
-        """Tell whether one thread does all."""
-        return self._pool is None
+    def edges(self) -> tuple[Indices, Indices]:
+        """Return where the threads' ranges of chunks end, for passes and for those over pairs."""
+        passes, pairs = ([0, *(end for _, end in own)] for own in (self._passes, self._pairs))
+        return np.array(passes, np.intp), np.array(pairs, np.intp)
+
+    @cached_property
+    def share(self) -> Any:
+        """Return what does the parts of a pass at the same time, an eg_share; null if alone."""
+
+        pool = self._pool  # not self: the threads end with it
+
+        def together(part: int, work: int, count: int) -> None:
+            call = Part(part)
+            _together(pool, [partial(call, work, k) for k in range(count)])
+
+        return Share() if pool is None else Share(together)
 
     @property
     def factored(self) -> bool:
@@ -184,11 +199,17 @@ class NativeLinearizer:
         of_cameras = np.empty((n, d, d)) if self.factored else None
         arrays = map(address, (sums, U, of_cameras, g_cameras))
         function("bundle_camera_blocks")(self.reference, *arrays)
-        blocks = None
-        if depths is not None and of_cameras is not None:
-            blocks = self.layout.outward(of_cameras), depths
-        coupling = NativeCoupling(self, *estimate)
-        return Normal(self.wide(U), V, self.wide(g_cameras), g, coupling, blocks)
+        normal = self.normal(*estimate, U, V, g_cameras, g)
+        if depths is None or of_cameras is None:
+            return normal
+        return replace(normal, depth_blocks=(self.layout.outward(of_cameras), depths))
+
+    def normal(
+        self, cameras: Array, points: Array, U: Array, V: Array, g_cameras: Array, g: Array
+    ) -> Normal:
+        """Return normal equations of cameras in the order of the skyline in their own."""
+        coupling = NativeCoupling(self, cameras, points)
+        return Normal(self.wide(U), V, self.wide(g_cameras), g, coupling)
 
     def refine_points(
         self, cameras: Array, points: Array, how: PointRefinement
@@ -304,21 +325,11 @@ class NativeLinearizer:
         count, m = len(self._passes), self.graph.n_points
         edges = [m * k // count for k in range(count + 1)]
         parts = [slice(begin, end) for begin, end in zip(edges[:-1], edges[1:], strict=True)]
-        return self._together([partial(call, part) for part in parts])
+        return _together(self._pool, [partial(call, part) for part in parts])
 
     def _share(self, ranges: list[Range], call: Callable[[int, int, int], int]) -> None:
-        for status in self._together([partial(call, k, *own) for k, own in enumerate(ranges)]):
+        for status in _together(self._pool, [partial(call, k, *own) for k, own in enumerate(ranges)]):
             checked(status)
-
-    def _together(self, calls: list[Callable[[], Any]]) -> list[Any]:
-        """Make calls at the same time, the first one here."""
-        if self._pool is None:
-            return [call() for call in calls]
-        pending = [self._pool.submit(call) for call in calls[1:]]
-        try:
-            return [calls[0](), *(future.result() for future in pending)]
-        finally:  # C has addresses only: after Ctrl-C, too, the arrays stay until it is done
-            wait(pending)
 
 
 @dataclass(frozen=True)
@@ -448,6 +459,17 @@ class NativeFactor:
         layout, (n, a, k) = self.linearizer.layout, right.shape
         rows = layout.inward(right).reshape(n * a, k).T
         return layout.outward(self.inner.solve(rows).T.reshape(n, a, k))
+
+
+def _together(pool: ThreadPoolExecutor | None, calls: list[Callable[[], Any]]) -> list[Any]:
+    """Make calls at the same time, the first one here."""
+    if pool is None:
+        return [call() for call in calls]
+    pending = [pool.submit(call) for call in calls[1:]]
+    try:
+        return [calls[0](), *(future.result() for future in pending)]
+    finally:  # C has addresses only: after Ctrl-C, too, the arrays stay until it is done
+        wait(pending)
 
 
 def _contiguous(array: Array | None) -> Array | None:

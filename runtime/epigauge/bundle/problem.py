@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge.bundle import compiled
 from epigauge.bundle.freedom import Freedom
-from epigauge.bundle.linearizer import Linearizer, PointRefinement
+from epigauge.bundle.linearizer import Linearizer, Normal, PointRefinement
 from epigauge.bundle.priors import Priors
 from epigauge.bundle.solve import BundleSystem, Step
 from epigauge.cameras import MAX_FOCAL, MIN_FOCAL, CameraModel
@@ -109,9 +109,10 @@ class BundleProblem:
         done = compiled.minimized(self, start, damping, schedule, stopping, scale, lam_floor)
         if done is None:
             return None
-        cameras, points, cost, steps, counts, rows = done
-        state = BundleState(Estimate(cameras, points, start.steps + steps), cost)
-        return lm.Outcome(state, None, *counts, rows)
+        steps = sum(row.accepted for row in done.history) - 1
+        found = Estimate(done.cameras, done.points, start.steps + steps)
+        system = None if done.normal is None else self._system(done.normal, found)
+        return lm.Outcome(BundleState(found, done.cost), system, *done.counts, done.history)
 
     def evaluate(self, estimate: Estimate) -> BundleState:
         """Return the state of an estimate; a cost of infinity where it has none."""
@@ -128,8 +129,11 @@ class BundleProblem:
 
     def linearize(self, state: BundleState) -> BundleSystem:
         """Return the normal equations."""
-        cameras, points = state.cameras, state.points
-        normal = self.linearizer.linearize(cameras, points)
+        normal = self.linearizer.linearize(state.cameras, state.points)
+        return self._system(normal, state.estimate)
+
+    def _system(self, normal: Normal, estimate: Estimate) -> BundleSystem:
+        cameras, points = estimate.cameras, estimate.points
         if self.priors is not None:
             normal = self.priors.added(normal, cameras, points)
         normal, border = self.freedom.constrained(normal, cameras, points)

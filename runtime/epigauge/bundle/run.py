@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -197,9 +196,6 @@ def minimized(
         minimize = far.minimize if jumps else lm.minimize
         begun, unit = Estimate(cameras, points), job.scale_px**2
         outcome = minimize(problem, begun, act, schedule(), stopping, callback, unit)
-        if outcome.system is None and not homogeneous and np.isfinite(outcome.state.cost):
-            # The verdict on metric cameras is about the system, which the compiled loop leaves out.
-            outcome = replace(outcome, system=problem.linearize(outcome.state))
         found = outcome.state.cameras, outcome.state.points
         claims = homogeneous and outcome.status > 0 and not jumps
         if claims and not checked(*found, outcome.state, begun):

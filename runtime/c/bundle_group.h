@@ -1,0 +1,70 @@
+/* Observations of some chunks, as their pairs are added up: lane by lane, in rising order of views. */
+#ifndef EPIGAUGE_BUNDLE_GROUP_H
+#define EPIGAUGE_BUNDLE_GROUP_H
+
+#include "bundle_chunk.h"
+
+/* Doubles of turned factors that a group holds, of more chunks than one. With more of them the sums of
+   a pair of views stay longer in the fast cache; with fewer the factors do. */
+#define EG_GROUP 32768
+
+struct eg_group {
+    ptrdiff_t lanes, count; /* that hold a point; observations */
+    double *turned;         /* so many doubles an observation as its route says */
+    double *moments;        /* 16 a lane, of the factored route */
+    int32_t *first;         /* first observation of each lane, and the end */
+    int32_t *view, *lane;   /* of each observation */
+    int32_t *end, *sorted;  /* scratch: an entry a view and two more; one an observation */
+};
+
+/* Lay out the lanes of a chunk behind those there are. */
+static inline void eg_group_append(eg_group *group, const eg_chunk *chunk)
+{
+    for (ptrdiff_t j = 0; j < chunk->M && chunk->count[j]; ++j) {
+        group->first[group->lanes] = (int32_t)group->count;
+        for (ptrdiff_t s = 0; s < chunk->count[j]; ++s) {
+            group->view[group->count] = chunk->view[s * chunk->M + j];
+            group->lane[group->count++] = (int32_t)group->lanes;
+        }
+        group->first[++group->lanes] = (int32_t)group->count;
+    }
+}
+
+/* End of the chunks from `begin` on that make a group. */
+static inline ptrdiff_t eg_group_end(const eg_bundle *b, ptrdiff_t begin, ptrdiff_t end, ptrdiff_t turned)
+{
+    ptrdiff_t next = begin + 1;
+    while (next < end && (b->rows[next + 1] - b->rows[begin]) * turned <= EG_GROUP)
+        ++next;
+    return next;
+}
+
+/* A group with room for the largest of some chunks; 1 where there is no memory. */
+static inline int eg_group_begin(eg_group *group, const eg_bundle *b, const eg_route *route,
+                                 ptrdiff_t begin, ptrdiff_t end)
+{
+    ptrdiff_t rows = 0, lanes = 0;
+    for (ptrdiff_t c = begin, next; c < end; c = next) {
+        next = eg_group_end(b, c, end, route->turned);
+        rows = b->rows[next] - b->rows[c] > rows ? b->rows[next] - b->rows[c] : rows;
+        lanes = b->lanes[next] - b->lanes[c] > lanes ? b->lanes[next] - b->lanes[c] : lanes;
+    }
+    const ptrdiff_t moments = route->factored ? 16 * lanes : 0;
+    const ptrdiff_t whole = 3 * rows + lanes + 1 + b->n_views + 2;
+    group->turned = eg_aligned(route->turned * rows + moments + (whole + 1) / 2);
+    group->moments = group->turned + route->turned * rows;
+    group->view = (int32_t *)(group->moments + moments);
+    group->lane = group->view + rows;
+    group->sorted = group->lane + rows;
+    group->first = group->sorted + rows;
+    group->end = group->first + lanes + 1;
+    return !group->turned;
+}
+
+static inline void eg_group_clear(eg_group *group)
+{
+    group->lanes = group->count = 0;
+    group->first[0] = 0;
+}
+
+#endif
