@@ -13,6 +13,7 @@ EG_EXPORT ptrdiff_t eg_shared_size(const char *name)
     } shared[] = {
         {"eg_bundle", sizeof(eg_bundle)},
         {"eg_envelope", sizeof(eg_envelope)},
+        {"eg_blocks", sizeof(eg_blocks)},
         {"eg_refinement", sizeof(eg_refinement)},
         {"eg_bundle_options", sizeof(eg_bundle_options)},
         {"eg_bundle_normal", sizeof(eg_bundle_normal)},

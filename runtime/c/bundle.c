@@ -25,13 +25,12 @@ void eg_bundle_pack(
     }
 }
 
-/* Doubles a camera and a pair of cameras in the sums of linearize and schur, and those of a row. */
-void eg_bundle_widths(const eg_bundle *bundle, ptrdiff_t *widths)
+/* Doubles a camera in the sums of linearize; how those of schur are stored. */
+void eg_bundle_widths(const eg_bundle *bundle, ptrdiff_t *camera, eg_blocks *pairs)
 {
     const eg_route route = eg_route_of(bundle);
-    widths[0] = route.camera_sums;
-    widths[1] = route.pair_sums;
-    widths[2] = route.padded;
+    *camera = route.camera_sums;
+    *pairs = route.pair_sums;
 }
 
 /* Cost of each point: the weighted robust sum of its squared residuals. */

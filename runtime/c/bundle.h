@@ -65,7 +65,7 @@ EG_EXPORT void eg_bundle_pack(
     eg_bundle *bundle, const ptrdiff_t *first, const ptrdiff_t *view, const double *q,
     const double *weights, int32_t *packed_view, double *packed_q, double *packed_weights);
 
-EG_EXPORT void eg_bundle_widths(const eg_bundle *bundle, ptrdiff_t *widths);
+EG_EXPORT void eg_bundle_widths(const eg_bundle *bundle, ptrdiff_t *camera, eg_blocks *pairs);
 
 EG_EXPORT int eg_bundle_costs(
     const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras,

@@ -52,7 +52,8 @@ struct eg_route {
     ptrdiff_t camera, point; /* entries of a stored camera and of a point */
     ptrdiff_t tangent;       /* unknowns of a camera */
     ptrdiff_t padded;        /* width of the rows of sums */
-    ptrdiff_t camera_sums, pair_sums; /* doubles a camera and a pair of cameras */
+    ptrdiff_t camera_sums;   /* doubles a camera */
+    eg_blocks pair_sums;     /* how the sums of pairs of cameras are stored */
     ptrdiff_t sums;          /* rows of a point's sums: V, its damping where it has one, g */
     ptrdiff_t factors;       /* rows an observation that `turn` keeps of a chunk */
     ptrdiff_t turned;        /* doubles an observation when pairs are added */

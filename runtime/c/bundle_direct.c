@@ -182,7 +182,7 @@ eg_route eg_direct_route(const eg_bundle *bundle)
         .tangent = K,
         .padded = padded,
         .camera_sums = padded * (K + 1),
-        .pair_sums = padded * K,
+        .pair_sums = {K, padded * K, padded},
         .sums = b * (b + 1) / 2 + b,
         .turned = b * padded,
         .work = 2 + 2 * d + 4 * b + 2 * padded,

@@ -145,7 +145,7 @@ const eg_route eg_factored_route = {
     .tangent = 12,
     .padded = EG_MOMENTS,
     .camera_sums = EG_CAMERA,
-    .pair_sums = EG_PAIR,
+    .pair_sums = {.d = 12, .size = EG_PAIR},
     .sums = 24,
     .factors = 12,
     .turned = 12,

@@ -202,7 +202,7 @@ static void schur_part(void *self, ptrdiff_t k)
 {
     state *s = self;
     const ptrdiff_t *edge = s->options->pairs + k, unknowns = s->n * s->d;
-    const ptrdiff_t size = s->views->slot[s->n] * s->route.pair_sums;
+    const ptrdiff_t size = s->views->slot[s->n] * s->route.pair_sums.size;
     double *pairs = s->pairs + k * size, *coupled = s->coupled_cameras + k * unknowns;
     memset(pairs, 0, (size_t)size * sizeof(double));
     memset(coupled, 0, (size_t)unknowns * sizeof(double));
@@ -222,15 +222,12 @@ static void couple_part(void *self, ptrdiff_t k)
 static int reduce(state *s)
 {
     const ptrdiff_t n = s->n, d = s->d, count = s->views->slot[n];
-    const double *blocks = s->pairs;
-    ptrdiff_t size = s->route.pair_sums, length = s->route.padded;
-    if (s->route.factored) {
+    const eg_blocks dense = {d, d * d, d};
+    const int expanded = s->route.factored;
+    if (expanded)
         eg_bundle_pair_blocks(s->bundle, count, s->pairs, s->blocks);
-        blocks = s->blocks;
-        size = d * d;
-        length = d;
-    }
-    eg_skyline_reduce(s->views, s->panels, d, d, blocks, size, length, s->white, s->A, s->S);
+    eg_skyline_reduce(s->views, s->panels, expanded ? &dense : &s->route.pair_sums, d,
+                      expanded ? s->blocks : s->pairs, s->white, s->A, s->S);
     return eg_envelope_factor(s->panels, s->S);
 }
 
@@ -268,7 +265,7 @@ static int make_step(void *self, double lam, double *norm)
     if (whiten(s, lam) || together(s, roots_part, s->options->n_passes))
         return EG_STEP_SINGULAR;
     s->failed |= together(s, schur_part, parts);
-    add_parts(parts, s->views->slot[n] * s->route.pair_sums, s->pairs);
+    add_parts(parts, s->views->slot[n] * s->route.pair_sums.size, s->pairs);
     add_parts(parts, n * d, s->coupled_cameras);
     if (reduce(s))
         return EG_STEP_SINGULAR;
@@ -332,7 +329,7 @@ int eg_bundle_minimize(
     const struct { double **part; ptrdiff_t size; } parts[] = {
         {&s.statuses, passes > pairs ? passes : pairs}, {&s.trial_cameras, n * c},
         {&s.trial_points, m * b}, {&s.costs, m}, {&s.D, n * d * d}, {&s.D_points, m * b * b},
-        {&s.sums, passes * n * s.route.camera_sums}, {&s.pairs, pairs * count * s.route.pair_sums},
+        {&s.sums, passes * n * s.route.camera_sums}, {&s.pairs, pairs * count * s.route.pair_sums.size},
         {&s.blocks, s.route.factored ? count * d * d : 0}, {&s.A, n * d * d},
         {&s.white, n * d * d}, {&s.S, 144 * panels->slot[panels->n]}, {&s.x, 12 * panels->n},
         {&s.step, n * d}, {&s.T, m * b * b}, {&s.half, m * b}, {&s.coupled_cameras, pairs * n * d},

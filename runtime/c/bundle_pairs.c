@@ -61,7 +61,7 @@ EG_INLINE void eg_add_by_view(
 {
     if (!group->count)
         return;
-    const ptrdiff_t sums = route->pair_sums;
+    const ptrdiff_t sums = route->pair_sums.size;
     const double *turned = group->turned;
     int32_t high, row = eg_sort_by_view(group, &high);
     for (ptrdiff_t next = 0, run; row <= high; ++row) {

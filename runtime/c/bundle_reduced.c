@@ -54,9 +54,9 @@ void eg_bundle_pair_blocks(
 {
     const eg_route route = eg_route_of(bundle);
     const ptrdiff_t a = route.tangent;
-    for (ptrdiff_t k = 0; k < count; ++k, pairs += route.pair_sums, blocks += a * a) {
+    for (ptrdiff_t k = 0; k < count; ++k, pairs += route.pair_sums.size, blocks += a * a) {
         for (ptrdiff_t i = 0; !route.factored && i < a; ++i)
-            memcpy(blocks + a * i, pairs + route.padded * i, (size_t)a * sizeof(double));
+            memcpy(blocks + a * i, pairs + route.pair_sums.length * i, (size_t)a * sizeof(double));
         for (int p = 0; route.factored && p < 3; ++p)
             for (int i = 0; i < 4; ++i)
                 for (int q = 0; q < 3; ++q)

@@ -52,9 +52,12 @@ static inline void divide_by_transposed(const double *EG_RESTRICT L, double *EG_
     }
 }
 
-/* C -= X Y^T for panels X and Y of so many columns. */
-static inline void subtract_product(ptrdiff_t columns, const double *EG_RESTRICT X,
-                             const double *EG_RESTRICT Y, double *EG_RESTRICT C)
+/* Columns of a panel that stay in the fastest cache. */
+#define COLUMNS (8 * ROWS)
+
+/* C -= X Y^T for panels X and Y of at most COLUMNS columns. */
+static inline void subtract_some(ptrdiff_t columns, const double *EG_RESTRICT X,
+                                 const double *EG_RESTRICT Y, double *EG_RESTRICT C)
 {
     if (!columns)
         return;
@@ -78,6 +81,13 @@ static inline void subtract_product(ptrdiff_t columns, const double *EG_RESTRICT
             C[8 + k] -= f[k], C[ROWS + 8 + k] -= g[k], C[2 * ROWS + 8 + k] -= h[k],
                 C[3 * ROWS + 8 + k] -= i[k];
     }
+}
+
+/* The same for any number of columns. */
+static inline void subtract_product(ptrdiff_t columns, const double *X, const double *Y, double *C)
+{
+    for (ptrdiff_t p = 0; p < columns; p += COLUMNS)
+        subtract_some(columns - p < COLUMNS ? columns - p : COLUMNS, X + ROWS * p, Y + ROWS * p, C);
 }
 
 #endif

@@ -76,55 +76,64 @@ void eg_envelope_solve(
 }
 
 
-/* Where entry (r, c) of the lower triangle is, r >= c. */
-static inline ptrdiff_t entry(const eg_envelope *panels, ptrdiff_t r, ptrdiff_t c)
-{
-    const ptrdiff_t k = r / ROWS, l = c / ROWS;
-    return BLOCK * (panels->slot[k] + l - panels->first[k]) + ROWS * (c - ROWS * l) + r - ROWS * k;
-}
-
-/* X (n, a) = M (n, d) A (d, a), or M^T A for M (d, n); rows of M are so long, those of X a. */
-static void times(ptrdiff_t n, ptrdiff_t d, ptrdiff_t a, int turned, const double *M, ptrdiff_t length,
+/* X (n, a) = M (n, d) A (d, a), or M^T A for M (d, n). */
+static void times(ptrdiff_t n, ptrdiff_t d, ptrdiff_t a, int turned, const double *M,
                   const double *EG_RESTRICT A, double *EG_RESTRICT X)
 {
     memset(X, 0, (size_t)(n * a) * sizeof(double));
     for (ptrdiff_t i = 0; i < n; ++i)
         for (ptrdiff_t l = 0; l < d; ++l) {
-            const double value = turned ? M[length * l + i] : M[length * i + l];
-            if (value == 0.0)
-                continue;
+            const double value = turned ? M[n * l + i] : M[d * i + l];
             EG_SIMD
             for (ptrdiff_t k = 0; k < a; ++k)
                 X[a * i + k] += value * A[a * l + k];
         }
 }
 
-/* S = U - A^T P A in panels, for the pairs P of views, U (n, a, a) and A (n, d, a), NULL for I. The
-   block of the l-th pair, `size` l entries behind the first, has d rows of so many entries, one an
-   own tangent of the view with the lower number. Ones fill up the last panel. */
+/* Whether all matrices (a, a) are diagonal. */
+static int diagonal(ptrdiff_t count, ptrdiff_t a, const double *A)
+{
+    for (ptrdiff_t i = 0; i < count; ++i)
+        for (ptrdiff_t k = 0; k < a * a; ++k)
+            if (A[a * a * i + k] != 0.0 && k % (a + 1))
+                return 0;
+    return 1;
+}
+
+/* S = U - A^T P A in panels, for the pairs P of views, U (n, a, a) and A (n, d, a), NULL for I. Rows of
+   blocks are own tangents of the view with the lower number. Ones fill up the last panel. */
 void eg_skyline_reduce(
-    const eg_envelope *views, const eg_envelope *panels, ptrdiff_t d, ptrdiff_t a,
-    const double *blocks, ptrdiff_t size, ptrdiff_t length, const double *U, const double *A,
-    double *S)
+    const eg_envelope *views, const eg_envelope *panels, const eg_blocks *how, ptrdiff_t a,
+    const double *blocks, const double *U, const double *A, double *S)
 {
     double half[EG_MOST_TANGENT * EG_MOST_TANGENT], X[EG_MOST_TANGENT * EG_MOST_TANGENT];
+    const ptrdiff_t d = how->d;
+    const int scaled = A && a == d && diagonal(views->n, a, A);
     memset(S, 0, (size_t)(BLOCK * panels->slot[panels->n]) * sizeof(double));
     for (ptrdiff_t t = 0; t < views->n; ++t)
-        for (ptrdiff_t s = views->first[t]; s <= t; ++s, blocks += size) {
-            const double *own = blocks;
-            ptrdiff_t wide = length;
-            if (A) {
-                times(d, d, a, 0, blocks, length, A + d * a * t, half);
-                times(a, d, a, 1, A + d * a * s, a, half, X);
-                own = X;
-                wide = a;
+        for (ptrdiff_t s = views->first[t]; s <= t; ++s, blocks += how->size) {
+            const double *left = A + d * a * s, *right = A + d * a * t;
+            for (ptrdiff_t i = 0; i < d; ++i)
+                for (ptrdiff_t k = 0; k < d; ++k)
+                    X[d * i + k] = blocks[how->length * i + k];
+            for (ptrdiff_t i = 0; scaled && i < d; ++i)
+                for (ptrdiff_t k = 0; k < d; ++k)
+                    X[d * i + k] *= left[(a + 1) * i] * right[(a + 1) * k];
+            if (A && !scaled) {
+                times(d, d, a, 0, X, right, half);
+                times(a, d, a, 1, left, half, X);
             }
-            for (ptrdiff_t i = 0; i < a; ++i)
-                for (ptrdiff_t k = s == t ? i : 0; k < a; ++k) {
-                    double *to = S + entry(panels, a * t + k, a * s + i);
-                    *to = s == t ? U[a * (a * t + k) + i] - own[wide * i + k] : -own[wide * i + k];
-                }
+            for (ptrdiff_t k = 0; k < a; ++k) {
+                /* Entry (r, c) of the lower triangle is at 12 c of its row. */
+                const ptrdiff_t r = a * t + k, panel = r / ROWS;
+                double *to = S + BLOCK * (panels->slot[panel] - panels->first[panel])
+                             + r - ROWS * panel + ROWS * a * s;
+                for (ptrdiff_t i = 0; i < (s == t ? k + 1 : a); ++i)
+                    to[ROWS * i] = (s == t ? U[a * (a * t + k) + i] : 0.0) - X[a * i + k];
+            }
         }
-    for (ptrdiff_t r = a * views->n; r < ROWS * panels->n; ++r)
-        S[entry(panels, r, r)] = 1.0;
+    for (ptrdiff_t r = a * views->n; r < ROWS * panels->n; ++r) {
+        const ptrdiff_t panel = r / ROWS;
+        S[BLOCK * (panels->slot[panel] - panels->first[panel]) + r - ROWS * panel + ROWS * r] = 1.0;
+    }
 }

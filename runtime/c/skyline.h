@@ -23,9 +23,13 @@ EG_EXPORT int eg_envelope_factor(const eg_envelope *envelope, double *S);
 EG_EXPORT void eg_envelope_solve(
     const eg_envelope *envelope, const double *S, ptrdiff_t count, double *x);
 
+/* Blocks (d, d): entries from one to the next, and from row to row. */
+typedef struct {
+    ptrdiff_t d, size, length;
+} eg_blocks;
+
 EG_EXPORT void eg_skyline_reduce(
-    const eg_envelope *views, const eg_envelope *panels, ptrdiff_t d, ptrdiff_t a,
-    const double *blocks, ptrdiff_t size, ptrdiff_t length, const double *U, const double *A,
-    double *S);
+    const eg_envelope *views, const eg_envelope *panels, const eg_blocks *how, ptrdiff_t a,
+    const double *blocks, const double *U, const double *A, double *S);
 
 #endif

@@ -22,6 +22,7 @@ __all__ = [
     "PAIR",
     "PANEL",
     "TRACE",
+    "Blocks",
     "Bundle",
     "BundleOptions",
     "Envelope",
@@ -79,6 +80,17 @@ class Envelope(ctypes.Structure):
     _fields_ = (("n", _N), ("first", _P), ("slot", _P))
 
 
+class Blocks(ctypes.Structure):
+    """The eg_blocks of skyline.h."""
+
+    _fields_ = tuple((name, _N) for name in ("d", "size", "length"))
+
+    @staticmethod
+    def dense(d: int) -> Blocks:
+        """Return (d, d) blocks row by row."""
+        return Blocks(d, d * d, d)
+
+
 class Refinement(ctypes.Structure):
     """The eg_refinement of bundle.h."""
 
@@ -122,7 +134,6 @@ class NormalArrays(ctypes.Structure):
     _fields_ = tuple((name, _P) for name in ("U", "V", "g", "g_points"))
 
 
-
 #: The damping of a refinement: by the trace of a point's block, or by the block.
 TRACE, BLOCK = 0, 1
 
@@ -132,7 +143,7 @@ _RANGE = (_P, _N, _N)
 _TYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "bundle_pack": (None, (_P,) * 8),
     "camera_model_row": (_N, (ctypes.c_char_p,)),
-    "bundle_widths": (None, (_P, _P)),
+    "bundle_widths": (None, (_P, _P, _P)),
     "bundle_costs": (_I, (*_RANGE, *[_P] * 3)),
     "bundle_linearize": (_I, (*_RANGE, *[_P] * 6)),
     "bundle_refine_points": (_I, (*_RANGE, *[_P] * 5)),
@@ -150,7 +161,7 @@ _TYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "bundle_minimize": (_I, (_P,) * 10),
     "envelope_factor": (_I, (_P, _P)),
     "envelope_solve": (None, (_P, _P, _N, _P)),
-    "skyline_reduce": (None, (_P, _P, _N, _N, _P, _N, _N, _P, _P, _P)),
+    "skyline_reduce": (None, (_P, _P, _P, _N, _P, _P, _P, _P)),
 }
 
 
@@ -176,6 +187,7 @@ def _checked_library() -> ctypes.CDLL:
         {
             "eg_bundle": Bundle,
             "eg_envelope": Envelope,
+            "eg_blocks": Blocks,
             "eg_refinement": Refinement,
             "eg_bundle_options": BundleOptions,
             "eg_bundle_normal": NormalArrays,

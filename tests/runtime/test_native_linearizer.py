@@ -303,7 +303,7 @@ class TestSkyline:
         P = np.zeros((n, n, a, a))
         P[columns, rows], P[rows, columns] = blocks, np.swapaxes(blocks, 1, 2)
         U = np.broadcast_to(20.0 * a * np.eye(a), (n, a, a)).copy()
-        factor = skyline.factor(blocks, a, (a * a, a), U, None)
+        factor = skyline.factor(blocks, _native.Blocks.dense(a), U, None)
         S = -P
         S[np.arange(n), np.arange(n)] += U
         right = rng.standard_normal((3, n * a))

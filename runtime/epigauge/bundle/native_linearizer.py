@@ -24,6 +24,7 @@ from epigauge._native import (
     FACTORED,
     MOST_TANGENT,
     TRACE,
+    Blocks,
     Part,
     Refinement,
     Share,
@@ -103,9 +104,10 @@ class NativeLinearizer:
         self.layout = LaneLayout(graph, q, weights, row, used.astype(np.int32))
         self._bundle = self.layout.bundle(loss)
         self.reference = ctypes.byref(self._bundle)
-        widths = np.zeros(3, np.intp)
-        function("bundle_widths")(self.reference, address(widths))
-        self._camera_sums, self._pair_sums, self._row = widths.tolist()
+        camera_sums, self.pair_sums = ctypes.c_ssize_t(), Blocks()
+        widths = map(ctypes.addressof, (camera_sums, self.pair_sums))
+        function("bundle_widths")(self.reference, *widths)
+        self._camera_sums = camera_sums.value
         self._passes, self._pairs = self.layout.shares(workers)
         # The calling thread has the first share.
         others = max(len(self._passes), len(self._pairs)) - 1
@@ -291,7 +293,7 @@ class NativeLinearizer:
         """Return the pairs of W T T^T W^T within a skyline, and W T half (n, d)."""
         T, half = np.ascontiguousarray(T), _contiguous(half)
         before = (*map(address, (*at, T, half)), skyline.reference)
-        shapes = ((skyline.blocks, self._pair_sums), (len(at[0]), self.width))
+        shapes = ((skyline.blocks, self.pair_sums.size), (len(at[0]), self.width))
         pairs, cameras = self._summed("bundle_schur", before, *shapes, pairs=True)
         return NativePairs(self, skyline, pairs), self.wide(cameras)
 
@@ -328,7 +330,9 @@ class NativeLinearizer:
         return _together(self._pool, [partial(call, part) for part in parts])
 
     def _share(self, ranges: list[Range], call: Callable[[int, int, int], int]) -> None:
-        for status in _together(self._pool, [partial(call, k, *own) for k, own in enumerate(ranges)]):
+        for status in _together(
+            self._pool, [partial(call, k, *own) for k, own in enumerate(ranges)]
+        ):
             checked(status)
 
 
@@ -410,10 +414,10 @@ class NativePairs:
             A = np.broadcast_to(np.eye(own.model.tangent_size), U.shape)
         inner_U, inner_A = own.layout.inward(U), own.narrow(A)
         if own.factored:
-            blocks, sizes = self.blocks, (d * d, d)
+            blocks, how = self.blocks, Blocks.dense(d)
         else:
-            blocks, sizes = self.sums, (own._pair_sums, own._row)
-        return NativeFactor(own, self.skyline.factor(blocks, d, sizes, inner_U, inner_A))
+            blocks, how = self.sums, own.pair_sums
+        return NativeFactor(own, self.skyline.factor(blocks, how, inner_U, inner_A))
 
     def times(self, x: Array) -> Array:
         """Return P x for x (n, d, k)."""

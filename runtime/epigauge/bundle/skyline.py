@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from epigauge import _native
 from epigauge._library import address
-from epigauge._native import PANEL, function
+from epigauge._native import PANEL, Blocks, function
 
 __all__ = ["Skyline", "SkylineFactor", "narrow"]
 
@@ -98,19 +98,15 @@ class Skyline:
         first = columns.reshape(count, PANEL).min(axis=1)
         return Skyline.of(np.minimum(first, np.arange(count)))
 
-    def factor(
-        self, blocks: Array, d: int, sizes: tuple[int, int], U: Array, A: Array | None
-    ) -> SkylineFactor:
+    def factor(self, blocks: Array, how: Blocks, U: Array, A: Array | None) -> SkylineFactor:
         """Return a factor of U - A^T P A.
 
         Parameters
         ----------
         blocks : ndarray
-            P: an entry a block, as the C library sums it up; rows are own tangents of the column.
-        d : int
-            Own tangents of a camera.
-        sizes : tuple of int
-            Numbers from block to block, and from row to row.
+            P: an entry a block; rows are own tangents of the column.
+        how : Blocks
+            How a block is stored.
         U : ndarray, shape (n, a, a)
             Blocks of the diagonal.
         A : ndarray, shape (n, d, a), or None
@@ -127,11 +123,9 @@ class Skyline:
         function("skyline_reduce")(
             self.reference,
             panels.reference,
-            d,
+            ctypes.byref(how),
             a,
-            address(blocks),
-            *sizes,
-            *map(address, (U, A, S)),
+            *map(address, (blocks, U, A, S)),
         )
         if function("envelope_factor")(panels.reference, address(S)):
             raise np.linalg.LinAlgError("the reduced system is not positive definite")
