@@ -122,7 +122,6 @@ class NativeLinearizer:
     @cached_property
     def share(self) -> Any:
         """Return what does the parts of a pass at the same time, an eg_share; null if alone."""
-
         pool = self._pool  # not self: the threads end with it
 
         def together(part: int, work: int, count: int) -> None:
