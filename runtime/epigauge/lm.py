@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -20,6 +20,7 @@ from epigauge.errors import ArgumentError
 
 __all__ = [
     "STATUS",
+    "Adaptive",
     "Classic",
     "Damping",
     "Nielsen",
@@ -158,6 +159,29 @@ class Nielsen:
         lam *= self.growth
         self.growth *= 2.0
         return lam
+
+
+@dataclass
+class Adaptive:
+    """The classic rule until a step is rejected, then Nielsen's.
+
+    Steps along a curved valley fail beyond some length: the constant factor then tries too long a
+    step after every one that is accepted, while the gain ratio holds lambda near its best.
+    """
+
+    rule: Classic | Nielsen = field(default_factory=Classic)
+
+    def accepted(self, lam: float, ratio: float) -> float:
+        """Return what the rule in force says."""
+        return self.rule.accepted(lam, ratio)
+
+    def rejected(self, lam: float) -> float:
+        """Multiply lambda by the constant factor the first time, then as Nielsen does."""
+        if isinstance(self.rule, Nielsen):
+            return self.rule.rejected(lam)
+        larger = self.rule.rejected(lam)
+        self.rule = Nielsen()
+        return larger
 
 
 @dataclass(frozen=True)

@@ -160,7 +160,6 @@ def _known(problem: BundleProblem, own: NativeLinearizer, damping: Any, schedule
         and problem.priors is None
         and problem.refinement is not None
         and type(damping) is Covariant
-        and type(schedule) is lm.Classic
-        and schedule.factor == lm.Classic().factor
+        and schedule in (lm.Classic(), lm.Adaptive())
         and own.direct
     )

@@ -33,7 +33,11 @@ __all__ = ["BundleResult", "bundle_adjust"]
 
 Array = NDArray[np.float64]
 
-_SCHEDULES: dict[str, Callable[[], lm.Schedule]] = {"classic": lm.Classic, "nielsen": lm.Nielsen}
+_SCHEDULES: dict[str, Callable[[], lm.Schedule]] = {
+    "classic": lm.Classic,
+    "nielsen": lm.Nielsen,
+    "adaptive": lm.Adaptive,
+}
 
 
 @dataclass(frozen=True)
@@ -112,7 +116,7 @@ def bundle_adjust(
     gauge_mode: str = "explicit",
     damping: str | None = None,
     embedded: bool = True,
-    schedule: str = "classic",
+    schedule: str = "auto",
     robust: bool = False,
     loss: str = "linear",
     loss_scale_px: float | str = "auto",
@@ -159,8 +163,10 @@ def bundle_adjust(
         Another damping than the method's own.
     embedded : bool
         With "covariant", re-triangulate all points after each step.
-    schedule : {"classic", "nielsen"}
-        Rule for lambda.
+    schedule : {"auto", "classic", "nielsen", "adaptive"}
+        Rule for lambda: a constant factor, by the gain ratio, or the first until a step is rejected
+        and then the second. By default the first for projective cameras, as in the papers, and the
+        last for all others.
     robust : bool
         For measured tracks with gross errors: begin from what most observations agree on
         (``initialize(tracks, robust=True)``), adjust with a Cauchy loss, set aside what is beyond
@@ -244,7 +250,7 @@ def bundle_adjust(
         return without_gross_errors(partial(bundle_adjust, **options), tracks, start, table, last)
     as_choice("method", method, STRATEGIES)
     as_choice("gauge_mode", gauge_mode, ("explicit", "implicit"))
-    as_choice("schedule", schedule, _SCHEDULES)
+    as_choice("schedule", schedule, ("auto", *_SCHEDULES))
     as_choice("loss", loss, LOSSES)
     if damping is not None:
         as_choice("damping", damping, DAMPINGS)
@@ -264,6 +270,8 @@ def bundle_adjust(
     else:
         start = initialize(tracks, backend=backend) if start is None else start
         job = projective_job(tracks, start, **of_metric)
+    by_default = "classic" if job.model.homogeneous else "adaptive"
+    rule = by_default if schedule == "auto" else schedule
     scale_px = _loss_scale(loss, loss_scale_px, tracks, start)
     outcome, cameras, points = minimized(
         job,
@@ -275,7 +283,7 @@ def bundle_adjust(
         gauge_mode=gauge_mode,
         damping=damping,
         embedded=embedded,
-        schedule=_SCHEDULES[schedule],
+        schedule=_SCHEDULES[rule],
         loss=Loss(loss, scale_px / job.scale_px),
         stopping=stopping,
         workers=workers,

@@ -1,0 +1,219 @@
+"""Calibrated scenes: rotations, translations, points, and the cameras that saw them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.cameras.checks import counted, finite_rows, frozen
+from epigauge.cameras.intrinsics import Cameras
+from epigauge.cameras.models import camera_model
+from epigauge.errors import ArgumentError
+from epigauge.multi_view.tracks import Reconstruction, Tracks
+
+__all__ = ["MetricReconstruction"]
+
+Array = NDArray[np.float64]
+
+#: How far R^T R may be from the identity.
+ORTHONORMAL = 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class MetricReconstruction:
+    """Calibrated cameras and points: shape without unit of length, place and direction in space.
+
+    Parameters
+    ----------
+    R : array_like, shape (n, 3, 3)
+        Rotations, ``x_cam = R X + t``.
+    t : array_like, shape (n, 3)
+        Translations.
+    X : array_like, shape (m, 3)
+        Points.
+    cameras : Cameras
+        Their model and parameters.
+
+    Raises
+    ------
+    ArgumentError
+        On other shapes, numbers that are not finite, matrices R that are no rotations (the message
+        says how to repair them), and cameras that have no rotation.
+    """
+
+    R: Array
+    t: Array
+    X: Array
+    cameras: Cameras
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.cameras, Cameras):
+            was = f"is a {type(self.cameras).__name__}"
+            raise ArgumentError("cameras", was, "eg.Cameras(model, params, camera_of_view)")
+        if not camera_model(self.cameras.model).metric:
+            was = f"are of the model {self.cameras.model!r}, which has no rotation"
+            raise ArgumentError("cameras", was, "a calibrated model, or eg.Reconstruction(P, Q)")
+        R = finite_rows("R", self.R, (3, 3), "one rotation a view")
+        t = finite_rows("t", self.t, (3,), "one translation a view")
+        X = finite_rows("X", self.X, (3,), "one point a row")
+        n = len(self.cameras.camera_of_view)
+        for name, array in (("R", R), ("t", t)):
+            if len(array) != n:
+                raise ArgumentError(name, f"has {len(array)} rows", f"{n}, a row a view")
+        if not len(X):
+            raise ArgumentError("X", "has no row", "at least one point")
+        _check_rotations(R)
+        for name, array in (("R", R), ("t", t), ("X", X)):
+            object.__setattr__(self, name, frozen(array))
+
+    @property
+    def n_views(self) -> int:
+        """Number of views."""
+        return len(self.R)
+
+    @property
+    def n_points(self) -> int:
+        """Number of points."""
+        return len(self.X)
+
+    @property
+    def vectors(self) -> Array:
+        """What the kernels of the model take for each view, (n, 12 + k): (R | t), parameters."""
+        pose = np.concatenate([self.R, self.t[:, :, None]], axis=2).reshape(-1, 12)
+        return np.asarray(np.concatenate([pose, self.cameras.of_views], axis=1))
+
+    @property
+    def centres(self) -> Array:
+        """Centres of projection -R^T t, (n, 3)."""
+        return np.asarray(-np.einsum("nji,nj->ni", self.R, self.t))
+
+    @property
+    def P(self) -> Array:
+        """Cameras to pixels without distortion, (n, 3, 4).
+
+        K (R | t), where K is the camera near its optical axis: (K h)[:2] / (K h)[2] is the image of
+        h to first order in h[0] and h[1].
+        """
+        K = self._calibrations()
+        return np.asarray(K @ np.concatenate([self.R, self.t[:, :, None]], axis=2))
+
+    def project(self, tracks: Tracks, backend: str | None = None) -> Array:
+        """Return the predicted pixels of all observations.
+
+        Parameters
+        ----------
+        tracks : Tracks
+            Which point is seen in which view.
+        backend : {"c", "numpy", "casadi"}, optional
+            Whose kernels to use; by default the active one's.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            In the tracks' order; infinite or NaN where the model has no image of a point.
+
+        Raises
+        ------
+        ArgumentError
+            If the tracks are of other numbers of views or points.
+        """
+        return np.ascontiguousarray(self._images(tracks, backend)[0].T)
+
+    def depths(self, tracks: Tracks, backend: str | None = None) -> Array:
+        """Return how far in front of its camera each observed point lies.
+
+        Parameters
+        ----------
+        tracks : Tracks
+            Which point is seen in which view.
+        backend : {"c", "numpy", "casadi"}, optional
+            Whose kernels to use; by default the active one's.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Along the optical axis (the distance where a camera sees all around), in the unit of the
+            scene; zero or less for a point that is not in front.
+
+        Raises
+        ------
+        ArgumentError
+            If the tracks are of other numbers of views or points.
+        """
+        return np.asarray(self._images(tracks, backend)[1])
+
+    def rms_px(self, tracks: Tracks) -> float:
+        """Return the root mean square of the residual coordinates.
+
+        Parameters
+        ----------
+        tracks : Tracks
+            Observations.
+
+        Returns
+        -------
+        float
+            sqrt(sum of squared residual coordinates / (2 N)), in pixels.
+        """
+        with np.errstate(over="ignore"):
+            return float(np.sqrt(np.mean((tracks.xy - self.project(tracks)) ** 2)))
+
+    def to_projective(self) -> Reconstruction:
+        """Return the scene as projective cameras and points; distortion has no place there.
+
+        Returns
+        -------
+        Reconstruction
+            ``P`` of this scene, and the points with a fourth coordinate one. It projects to the
+            same pixels where the model has no distortion.
+        """
+        return Reconstruction(self.P, np.column_stack([self.X, np.ones(len(self.X))]))
+
+    def _images(self, tracks: Tracks, backend: str | None) -> tuple[Array, Array]:
+        """Return pixels (2, N) and depths (N,)."""
+        if (tracks.n_views, tracks.n_points) != (self.n_views, self.n_points):
+            was = f"are of {tracks.n_views} views and {tracks.n_points} points"
+            raise ArgumentError("tracks", was, f"{self.n_views} and {self.n_points}, as here")
+        project = camera_model(self.cameras.model).kernel("project", backend)
+        with np.errstate(all="ignore"):
+            pair: tuple[Array, Array] = project(self.vectors[tracks.view].T, self.X[tracks.point].T)
+        return pair
+
+    def _calibrations(self) -> Array:
+        """Return K of each view, from image and derivative on the optical axis."""
+        axis = np.broadcast_to(np.array([0.0, 0.0, 1.0])[:, None], (3, len(self.cameras)))
+        image = camera_model(self.cameras.model).kernel("image")
+        with np.errstate(all="ignore"):
+            centre, slope = image(axis, self.cameras.params.T)
+        K = np.zeros((len(self.cameras), 3, 3))
+        K[:, :2, :2] = np.moveaxis(slope[:, :2], 2, 0)
+        K[:, :2, 2] = centre.T
+        K[:, 2, 2] = 1.0
+        if not np.isfinite(K).all():
+            was = f"are of the model {self.cameras.model!r}"
+            raise ArgumentError("cameras", was, "a model with an optical axis")
+        return np.asarray(K[self.cameras.camera_of_view])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the arguments: arrays from a pickle could be written to."""
+        return type(self), (self.R, self.t, self.X, self.cameras)
+
+    def __repr__(self) -> str:
+        views, points = counted(self.n_views, "view"), counted(self.n_points, "point")
+        return f"MetricReconstruction({views}, {points}, {self.cameras!r})"
+
+
+def _check_rotations(R: Array) -> None:
+    error = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
+    bad = np.flatnonzero(~(error <= ORTHONORMAL))
+    if len(bad):
+        was = f"has R^T R away from the identity by {error[bad[0]]:.1g} in row {bad[0]}"
+        needed = "rotations; the nearest one of a matrix is U @ Vt of U, s, Vt = np.linalg.svd(R)"
+        raise ArgumentError("R", was, needed)
+    mirrored = np.flatnonzero(np.linalg.det(R) < 0.0)
+    if len(mirrored):
+        was = f"has a reflection (determinant -1) in row {mirrored[0]}"
+        raise ArgumentError("R", was, "rotations: change the sign of R and t where all are so")
