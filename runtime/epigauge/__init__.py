@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge import casadi, colmap, datasets, interop, kernels, verdicts
     from epigauge.bundle.priors import IntrinsicPrior, PointPrior, PositionPrior
-    from epigauge.cameras import Cameras, MetricReconstruction
+    from epigauge.cameras import AffineReconstruction, Cameras, MetricReconstruction
     from epigauge.errors import ArgumentError, BackendError, EpigaugeError, FileFormatError
     from epigauge.images import ImageMatches, load_image, match_images
     from epigauge.io import (
@@ -31,6 +31,7 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge.kernels import backend, set_backend
     from epigauge.multi_view import gauge
     from epigauge.multi_view.adjust import BundleResult, bundle_adjust
+    from epigauge.multi_view.affine_start import initialize_affine
     from epigauge.multi_view.compare import Comparison, compare
     from epigauge.multi_view.initialize import initialize
     from epigauge.multi_view.tracks import Reconstruction, Tracks
@@ -52,6 +53,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "BATCH_STATUS",
+    "AffineReconstruction",
     "ArgumentError",
     "BackendError",
     "BundleResult",
@@ -86,6 +88,7 @@ __all__ = [
     "fundamental_8point",
     "gauge",
     "initialize",
+    "initialize_affine",
     "interop",
     "kernels",
     "load_image",
@@ -114,7 +117,7 @@ __all__ = [
 #: Modules below this package, and the public names that they define.
 _WHERE = {
     "bundle.priors": "IntrinsicPrior PointPrior PositionPrior",
-    "cameras": "Cameras MetricReconstruction",
+    "cameras": "AffineReconstruction Cameras MetricReconstruction",
     "errors": "ArgumentError BackendError EpigaugeError FileFormatError",
     "images": "ImageMatches load_image match_images",
     "io": (
@@ -123,6 +126,7 @@ _WHERE = {
     ),
     "kernels": "backend set_backend",
     "multi_view.adjust": "BundleResult bundle_adjust",
+    "multi_view.affine_start": "initialize_affine",
     "multi_view.compare": "Comparison compare",
     "multi_view.initialize": "initialize",
     "multi_view.tracks": "Reconstruction Tracks",

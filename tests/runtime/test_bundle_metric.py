@@ -302,9 +302,52 @@ def test_bad_options_are_refused(options: dict[str, Any], named: str) -> None:
 
 def test_what_only_metric_starts_have_is_refused_for_others() -> None:
     tracks, start = scene()
-    for options in ({"refine": "pose"}, {"fixed_views": [0]}, {"priors": [PRIORS[0]]}):
+    for options in ({"refine": "pose"}, {"priors": [PRIORS[0]]}):
         with pytest.raises(eg.ArgumentError, match="projective start"):
             eg.bundle_adjust(tracks, start.to_projective(), **options)
+
+
+@pytest.mark.parametrize("backend", ["c", "numpy"])
+@pytest.mark.parametrize(
+    ("views", "points", "left"), [((0,), (), 4), ((0, 2), (7,), 0), ((), (1, 2, 3), 6)]
+)
+def test_projective_views_and_points_can_be_fixed(
+    backend: str, views: tuple[int, ...], points: tuple[int, ...], left: int
+) -> None:
+    """Of the 15 changes of basis, a camera takes 11 and a point 3."""
+    many_views.need_backend(backend)
+    tracks, _ = scene()
+    start = eg.initialize(tracks)
+    found = eg.bundle_adjust(
+        tracks, start, fixed_views=views, fixed_points=points, backend=backend, ftol=1e-13
+    )
+    assert np.array_equal(found.reconstruction.P[list(views)], start.P[list(views)])
+    assert np.array_equal(found.reconstruction.Q[list(points)], start.Q[list(points)])
+    assert found.success
+    n, m = tracks.n_views - len(views), tracks.n_points - len(points)
+    assert found.rank == 11 * n + 3 * m - left
+    free = eg.bundle_adjust(tracks, start, ftol=1e-13)
+    if left:  # the frame alone is fixed
+        assert found.cost == pytest.approx(free.cost, rel=1e-9)
+    else:
+        assert free.cost < found.cost <= found.history[0].cost
+
+
+def test_all_views_fixed_leaves_intersections() -> None:
+    tracks, _ = scene()
+    start = eg.initialize(tracks)
+    found = eg.bundle_adjust(tracks, start, fixed_views=range(4), ftol=1e-13)
+    assert found.success
+    assert found.rank == 3 * tracks.n_points
+    # Each point alone is at its minimum.
+    for j in (0, 11):
+        held = [k for k in range(tracks.n_points) if k != j]
+        other = eg.bundle_adjust(
+            tracks, found.reconstruction, fixed_views=range(4), fixed_points=held, ftol=1e-13
+        )
+        assert other.cost == pytest.approx(found.cost, rel=1e-12)
+    with pytest.raises(eg.ArgumentError, match="method"):
+        eg.bundle_adjust(tracks, start, fixed_views=[0], method="hartley")
 
 
 def test_rank_counts_the_unknowns_and_what_fixes_the_gauge() -> None:

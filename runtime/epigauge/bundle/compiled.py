@@ -153,7 +153,8 @@ def _known(problem: BundleProblem, own: NativeLinearizer, damping: Any, schedule
     free = free and ties.E is None and ties.C is None
     if free and ties.A is not None:
         used = slice(None) if ties.used is None else ties.used
-        free = ties.A.shape[2] == own.width and bool((ties.A[:, used] == np.eye(own.width)).all())
+        moved, one = ties.A[:, used], np.eye(own.width)
+        free = moved.shape[1:] == one.shape and bool((moved == one).all())
     return (
         free
         and (model.metric or own.factored)

@@ -107,7 +107,7 @@ class Covariant(ByMatrix):
             )
         points = point_damping(system.model, system.V, None)
         if not system.model.metric:
-            return Blocks(system.U, np.ones(0), points)
+            return Blocks(_lifted(system.U), np.ones(0), _lifted(points))
         diagonal = np.einsum("nii->ni", system.U)
         # An unknown that moves no image, as the distortion of points on the axis: of the others'.
         diagonal = np.maximum(diagonal, _SMALL * diagonal.max(axis=0))
@@ -222,6 +222,12 @@ def _diagonals(blocks: Array) -> Array:
     # A point on an axis, as in the five-point gauge, has a zero for its scale.
     diagonals = np.maximum(diagonals, _LEAST * diagonals.mean(axis=1, keepdims=True))
     return np.asarray(diagonals[:, :, None] * np.eye(blocks.shape[1]))
+
+
+def _lifted(blocks: Array) -> Array:
+    """Return blocks that a flat scene does not leave singular; else the same to rounding."""
+    mean = np.einsum("nii->n", blocks) / blocks.shape[1]
+    return np.asarray(blocks + (_SMALL * mean)[:, None, None] * np.eye(blocks.shape[1]))
 
 
 def _positive(diagonal: Array) -> Array:

@@ -9,16 +9,19 @@ from numpy.typing import NDArray
 
 from epigauge.bundle.dampings import Covariant
 from epigauge.bundle.null_space import generators
-from epigauge.bundle.solve import BundleSystem, reduced_system
-from epigauge.bundle.ties import congruent
+from epigauge.bundle.solve import Bordered, BundleSystem, Iterated, reduced_system
+from epigauge.bundle.ties import Ties, congruent
 from epigauge.kernels import Table
 
 __all__ = ["Diagnosis", "diagnosed"]
 
 Array = NDArray[np.float64]
 
-#: An eigenvalue below this, where the diagonal is one, is rounding; the shift that is factored.
-_ROUNDING, _SHIFT = 1e-11, 1e-12
+#: An eigenvalue below this, where the diagonal is one, is rounding.
+_ROUNDING = 1e-11
+
+#: The shift that is factored: the first with which rounding leaves the matrix definite.
+_SHIFTS = 1e-12, 1e-10, 1e-8
 
 #: A motion of the gauge is held that resists more than this, of the one that resists most.
 _HELD = 1e-9
@@ -75,7 +78,6 @@ def diagnosed(
     least = np.linalg.eigvalsh(system.V / np.sqrt(size[:, :, None] * size[:, None, :]))
     free = ~known
     of_points = int(np.count_nonzero(least[free] <= _ROUNDING))
-    T, _ = system.inverse_roots(system.V, W.points, _SHIFT, system.gradients[2])
     white = congruent(ties.A, system.normal.U)
     a, r = white.shape[1], ties.n_shared
     frozen = 0 if system.ties.A is None else int(np.count_nonzero(~system.ties.A.any(axis=1)))
@@ -84,8 +86,10 @@ def diagnosed(
     nothing = np.zeros((n, d))
     if not system.normal.coupling.direct:
         return Diagnosis(unknowns - gauge - of_points, 0, float("inf"), nothing)
-    parts = system.normal, ties, system.own_roots(T), None
-    shifted, _ = reduced_system(*parts, white + _SHIFT * np.eye(a), _SHIFT)
+    factored = _factored(system, ties, W.points, white)
+    if factored is None:
+        return Diagnosis(unknowns - gauge - of_points - 1, 1, float("inf"), nothing)
+    shifted, shift = factored
     count = min(gauge + _COLUMNS, n * a - frozen + r)
     X = np.random.default_rng(0).standard_normal((n * a + r, count))
     for _ in range(_ITERATIONS):
@@ -94,7 +98,7 @@ def diagnosed(
         Y = np.concatenate([x.reshape(n * a, count), s])
         inverse, turn = np.linalg.eigh(0.5 * (X.T @ Y + Y.T @ X))
         X = Y @ turn
-    values = (1.0 / np.maximum(inverse, 1e-300) - _SHIFT)[::-1]
+    values = (1.0 / np.maximum(inverse, 1e-300) - shift)[::-1]
     X = X[:, ::-1] / np.linalg.norm(X[:, ::-1], axis=0)
     open_ = int(np.count_nonzero(values <= _ROUNDING))
     missing = max(open_ - gauge, 0)
@@ -106,6 +110,21 @@ def diagnosed(
     x, s = X[: n * a, first].reshape(n, a, 1), X[n * a :, first, None]
     weakest = ties.cameras(x, s)[..., 0] / np.sqrt(value)
     return Diagnosis(rank, missing, 1.0 / value, weakest)
+
+
+def _factored(
+    system: BundleSystem, ties: Ties, of_points: Array, white: Array
+) -> tuple[Bordered | Iterated, float] | None:
+    """Return the reduced system plus a shift, and that; None where it stays indefinite."""
+    for shift in _SHIFTS:
+        try:
+            T, _ = system.inverse_roots(system.V, of_points, shift, system.gradients[2])
+            parts = system.normal, ties, system.own_roots(T), None
+            lifted = white + shift * np.eye(white.shape[1])
+            return reduced_system(*parts, lifted, shift)[0], shift
+        except np.linalg.LinAlgError:
+            continue
+    return None
 
 
 def _free_gauge(system: BundleSystem, kernels: Table) -> int:

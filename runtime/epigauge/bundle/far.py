@@ -66,6 +66,8 @@ class JumpingProblem(BundleProblem):
         stayed, costs = super().refined(cameras, points)
         jumped, others = super().refined(cameras, self.linearizer.intersect(cameras))
         better = np.less(*(np.nan_to_num(cost, nan=np.inf) for cost in (others, costs)))
+        if self.freedom.kept is not None:
+            better &= ~self.freedom.kept
         return np.where(better[:, None], jumped, stayed), np.where(better, others, costs)
 
 

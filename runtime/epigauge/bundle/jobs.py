@@ -11,16 +11,24 @@ from numpy.typing import NDArray
 
 from epigauge.bundle.freedom import Freedom
 from epigauge.bundle.priors import Prior, Priors
-from epigauge.bundle.refinement import fixed_indices, refined_freedom
-from epigauge.cameras import CameraModel, Cameras, MetricReconstruction, camera_model
+from epigauge.bundle.refinement import fixed_indices, refined_freedom, whole_freedom
+from epigauge.cameras import (
+    AffineReconstruction,
+    CameraModel,
+    Cameras,
+    MetricReconstruction,
+    camera_model,
+)
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.tracks import Reconstruction, Tracks
 
-__all__ = ["Job", "metric_job", "projective_job"]
+__all__ = ["AnyReconstruction", "Job", "job_of", "metric_job"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+
+AnyReconstruction = Reconstruction | MetricReconstruction | AffineReconstruction
 
 #: Numbers of (R | t) before the intrinsics of a camera.
 _POSE = 12
@@ -55,38 +63,92 @@ class Job:
     scale_px: float
     cameras: Array
     points: Array
-    result: Callable[[Array, Array], Reconstruction | MetricReconstruction]
+    result: Callable[[Array, Array], AnyReconstruction]
     freedom: Freedom = field(default_factory=Freedom)
     priors: Priors | None = None
     fixes_gauge: bool = False
 
 
-def projective_job(tracks: Tracks, start: Reconstruction, **of_metric: Any) -> Job:
-    """Return the job of a projective start, in conditioned image coordinates.
+def job_of(
+    tracks: Tracks,
+    start: AnyReconstruction,
+    *,
+    refine: Any,
+    fixed_views: Iterable[int],
+    fixed_points: Iterable[int],
+    priors: Iterable[Prior] | None,
+) -> Job:
+    """Return the job of a start of any kind.
 
     Raises
     ------
     ArgumentError
-        If the start has another size than the tracks, or options of metric starts are given.
+        On anything that is no start, sizes other than the tracks', unknown parameters, priors on
+        what is fixed, or nothing left to refine.
     """
-    for name, value in of_metric.items():
-        nothing = (
-            value == "all" if isinstance(value, str) else value is None or not len(list(value))
-        )
-        if not nothing:
-            raise ArgumentError(name, "is given with a projective start", "a metric start")
-    _check_size(tracks, len(start.P), len(start.Q), "cameras")
-    frame = Frame.of(tracks)
+    asked = {"fixed_views": fixed_views, "fixed_points": fixed_points}
+    if isinstance(start, MetricReconstruction):
+        return metric_job(tracks, start, refine=refine, priors=priors, **asked)
+    if not isinstance(start, Reconstruction | AffineReconstruction):
+        kinds = "an eg.Reconstruction, eg.AffineReconstruction or eg.MetricReconstruction"
+        raise ArgumentError("start", f"is a {type(start).__name__}", kinds)
+    return uncalibrated_job(tracks, start, refine=refine, priors=priors, **asked)
+
+
+def uncalibrated_job(
+    tracks: Tracks,
+    start: Reconstruction | AffineReconstruction,
+    *,
+    refine: Any,
+    fixed_views: Iterable[int],
+    fixed_points: Iterable[int],
+    priors: Iterable[Prior] | None,
+) -> Job:
+    """Return the job of a projective or affine start, in conditioned image coordinates.
+
+    Raises
+    ------
+    ArgumentError
+        If the start has another size than the tracks, nothing is left to refine, or options of
+        metric starts are given.
+    """
+    affine = isinstance(start, AffineReconstruction)
+    kind = "an affine" if affine else "a projective"
+    if not (isinstance(refine, str) and refine == "all"):
+        was = f"is {refine!r:.60} with {kind} start, whose cameras are refined as a whole"
+        raise ArgumentError("refine", was, "'all', or fixed_views; or a metric start")
+    if priors is not None and len(list(priors)):
+        needed = "none, or a metric start: eg.MetricReconstruction"
+        raise ArgumentError("priors", f"are given with {kind} start, which has no unit", needed)
+    points = start.X if isinstance(start, AffineReconstruction) else start.Q
+    _check_size(tracks, len(start.P), len(points), "cameras")
+    views = fixed_indices("fixed_views", fixed_views, tracks.n_views)
+    held = fixed_indices("fixed_points", fixed_points, tracks.n_points)
+    if len(views) == tracks.n_views and len(held) == tracks.n_points:
+        raise ArgumentError("fixed_views", "and fixed_points leave nothing to refine", "an unknown")
+    frame, model = Frame.of(tracks), camera_model("affine" if affine else "projective")
 
     def measured(xy: Array) -> Array:
         return frame.points_in(xy, tracks.view)
 
-    def result(cameras: Array, points: Array) -> Reconstruction:
-        return Reconstruction(frame.cameras_out(cameras.reshape(-1, 3, 4)), points)
+    def result(cameras: Array, found: Array) -> AnyReconstruction:
+        P, found = frame.cameras_out(cameras.reshape(-1, 3, 4)), found.copy()
+        # What was fixed comes back as it was, to the last bit.
+        P[views], found[held] = start.P[views], points[held]
+        return AffineReconstruction(P[:, :2], found) if affine else Reconstruction(P, found)
 
     rows = frame.cameras_in(start.P).reshape(-1, _POSE)
-    q = _trusted(tracks, start, measured)
-    return Job(camera_model("projective"), q, frame.scale, rows, start.Q, result)
+    return Job(
+        model,
+        _trusted(tracks, start, measured),
+        frame.scale,
+        rows,
+        points,
+        result,
+        whole_freedom(model, len(rows), len(points), views, held),
+        None,
+        bool(len(views) + len(held)),
+    )
 
 
 def metric_job(
@@ -149,7 +211,7 @@ def _check_size(tracks: Tracks, n: int, m: int, what: str) -> None:
 
 def _trusted(
     tracks: Tracks,
-    start: Reconstruction | MetricReconstruction,
+    start: AnyReconstruction,
     measured: Callable[[Array], Array],
 ) -> Array:
     """Return the measurements (2, N); those of weight zero where the start has them.

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from epigauge.bundle.freedom import Freedom
 from epigauge.bundle.priors import IntrinsicPrior, PointPrior, PositionPrior, Prior
 from epigauge.bundle.ties import Ties
-from epigauge.cameras import Cameras, MetricReconstruction, camera_model
+from epigauge.cameras import CameraModel, Cameras, MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 
-__all__ = ["fixed_indices", "refinable", "refined_freedom"]
+__all__ = ["fixed_indices", "refinable", "refined_freedom", "whole_freedom"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -79,6 +79,32 @@ def fixed_indices(name: str, value: Iterable[int], count: int) -> Indices:
     return np.unique(array).astype(np.intp)
 
 
+def whole_freedom(
+    model: CameraModel, n: int, m: int, fixed_views: Indices, fixed_points: Indices
+) -> Freedom:
+    """Return what is free of cameras that are refined as a whole, or not at all.
+
+    Parameters
+    ----------
+    model : CameraModel
+        The camera.
+    n, m : int
+        Numbers of views and points.
+    fixed_views, fixed_points : ndarray of int
+        What stays.
+    """
+    if not len(fixed_views) + len(fixed_points):
+        return Freedom()
+    A = None
+    if len(fixed_views):
+        A = np.tile(np.eye(model.tangent_size), (n, 1, 1))
+        A[fixed_views] = 0.0
+    kept = np.zeros(m, np.bool_)
+    kept[fixed_points] = True
+    ties = Ties(A=A, C=_points(m, fixed_points, model.point_size))
+    return Freedom(ties, kept if kept.any() else None)
+
+
 def refined_freedom(
     start: MetricReconstruction,
     refine: Any,
@@ -115,7 +141,7 @@ def refined_freedom(
     if local:
         A[:, POSE:, POSE:] = np.where(alone[:, None, None], of_view, 0.0)
     whole = A.shape[1] == A.shape[2] and (A == np.eye(len(A[0]))).all()
-    ties = Ties(A=None if whole else A, C=_points(m, fixed_points))
+    ties = Ties(A=None if whole else A, C=_points(m, fixed_points, 3))
     several = np.flatnonzero(views > 1)
     if q and len(several):
         number = np.zeros(len(cameras), np.intp)
@@ -130,10 +156,10 @@ def refined_freedom(
     return Freedom(ties, kept if kept.any() else None)
 
 
-def _points(m: int, fixed: Indices) -> Array | None:
+def _points(m: int, fixed: Indices, size: int) -> Array | None:
     if not len(fixed):
         return None
-    C = np.tile(np.eye(3), (m, 1, 1))
+    C = np.tile(np.eye(size), (m, 1, 1))
     C[fixed] = 0.0
     return C
 

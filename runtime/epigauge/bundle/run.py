@@ -130,6 +130,9 @@ def minimized(
         what = "damping" if damping else "method"
         needed = "a projective start, or another method"
         raise ArgumentError(what, f"is {name!r} for {job.model.name} cameras", needed)
+    if strategy.gauge is not None and not (job.model.metric or job.model.homogeneous):
+        was = f"is {method!r} for {job.model.name} cameras, which have no gauge of that name"
+        raise ArgumentError("method", was, "'covariant', 'levenberg', 'marquardt' or 'free'")
     act: Any = DAMPINGS[name](kernels)
     if not isinstance(act, ByMatrix):
         # Such a step is made for all parameters, free and unconstrained.
@@ -204,7 +207,8 @@ def minimized(
         return (outcome, *(there.inverse().apply(*found) if home else found))
 
     try:
-        if homogeneous:
+        # What is fixed must not be moved by a thousandth.
+        if homogeneous and not job.fixes_gauge:
             return far.minimized_from(attempt, job.cameras, job.points)
         return attempt(job.cameras, job.points)
     except np.linalg.LinAlgError:

@@ -1,4 +1,4 @@
-"""Projective bundle adjustment with any gauge strategy."""
+"""Bundle adjustment of cameras of any model, with any gauge strategy."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 from epigauge import kernels, lm
 from epigauge._arguments import as_choice, as_count, as_positive
 from epigauge.bundle.dampings import DAMPINGS
-from epigauge.bundle.jobs import metric_job, projective_job
+from epigauge.bundle.jobs import AnyReconstruction, job_of
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.priors import Prior
 from epigauge.bundle.refinement import fixed_indices
 from epigauge.bundle.run import checked_gauge, minimized
 from epigauge.bundle.strategies import STRATEGIES
-from epigauge.cameras import MetricReconstruction
+from epigauge.cameras import AffineReconstruction, MetricReconstruction
 from epigauge.multi_view.gauge import Gauge
 from epigauge.multi_view.initialize import initialize
 from epigauge.multi_view.rejection import without_gross_errors
 from epigauge.multi_view.repeated import merging_sightings
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.tracks import Tracks
 from epigauge.multi_view.verdicts import Verdict, judged, judged_metric
 from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
 from epigauge.verdicts import FLAGS, usable
@@ -46,7 +46,7 @@ class BundleResult:
 
     Attributes
     ----------
-    reconstruction : Reconstruction or MetricReconstruction
+    reconstruction : Reconstruction, MetricReconstruction or AffineReconstruction
         Cameras and points, of the kind of the start; with method "covariant" in its basis.
     rms_px : float
         sqrt(sum of squared residual coordinates / (2 N)), of the N observations whose weight is not
@@ -75,8 +75,8 @@ class BundleResult:
         metric cameras scaled to a unit diagonal, of projective ones where the W of the covariant
         damping is one. Infinite where something is undetermined or the system is not factored.
     weakest : str
-        Of metric cameras the direction of that eigenvalue: its three largest standard deviations,
-        as shares of a radian, of the scene's size, or of the focal length.
+        Of metric and affine cameras the direction of that eigenvalue: its three largest standard
+        deviations, as shares of a radian, of the scene's size, or of the focal length.
     nfev, njev, nit, status, message, success, history
         As in `FundamentalResult`.
     """
@@ -105,7 +105,7 @@ class BundleResult:
 @merging_sightings
 def bundle_adjust(
     tracks: Tracks,
-    start: Reconstruction | MetricReconstruction | None = None,
+    start: AnyReconstruction | None = None,
     *,
     refine: str | Sequence[str] = "all",
     fixed_views: Iterable[int] = (),
@@ -131,20 +131,23 @@ def bundle_adjust(
     """Minimise the reprojection error of cameras and points.
 
     The start decides what cameras are: a `Reconstruction` has projective ones, known up to a change
-    of basis; a `MetricReconstruction` those of its camera model, known up to a similarity.
+    of basis; a `MetricReconstruction` those of its camera model, known up to a similarity; an
+    `AffineReconstruction` affine ones, known up to an affine change of space.
 
     Parameters
     ----------
     tracks : Tracks
         Observations.
-    start : Reconstruction or MetricReconstruction, optional
+    start : Reconstruction, MetricReconstruction or AffineReconstruction, optional
         Where to begin, in any basis; by default `initialize(tracks)`.
     refine : "all", "pose" or sequence of str
         Intrinsics of a metric start to be refined beside rotations, positions and points: all of
         them, none, or those named, such as ``("f", "k1")``. "f" of a model with fx and fy changes
         both and keeps their ratio. Views of one camera share its intrinsics.
     fixed_views, fixed_points : iterable of int
-        Of a metric start: views whose rotation and position, and points that stay where they are.
+        Views and points that stay where they are. Of a metric start a fixed view keeps rotation and
+        position; its intrinsics are refined unless `refine` says otherwise. With method
+        "covariant", without a gauge.
     priors : iterable, optional
         What is known of a metric reconstruction beside the images: `PositionPrior`,
         `IntrinsicPrior` and `PointPrior`, in the frame of the start.
@@ -259,17 +262,15 @@ def bundle_adjust(
     stopping = lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter)
     table = kernels.table(backend)
     fixed_views, fixed_points = tuple(fixed_views), tuple(fixed_points)
-    of_metric: dict[str, Any] = {
-        "refine": refine,
-        "fixed_views": fixed_views,
-        "fixed_points": fixed_points,
-        "priors": priors,
-    }
-    if isinstance(start, MetricReconstruction):
-        job = metric_job(tracks, start, **of_metric)
-    else:
-        start = initialize(tracks, backend=backend) if start is None else start
-        job = projective_job(tracks, start, **of_metric)
+    start = initialize(tracks, backend=backend) if start is None else start
+    job = job_of(
+        tracks,
+        start,
+        refine=refine,
+        fixed_views=fixed_views,
+        fixed_points=fixed_points,
+        priors=priors,
+    )
     by_default = "classic" if job.model.homogeneous else "adaptive"
     rule = by_default if schedule == "auto" else schedule
     scale_px = _loss_scale(loss, loss_scale_px, tracks, start)
@@ -291,21 +292,26 @@ def bundle_adjust(
     )
     reconstruction = job.result(cameras, points)
     rejected = np.zeros(len(tracks), dtype=np.bool_)
-    if isinstance(reconstruction, MetricReconstruction):
+    stays = (
+        fixed_indices("fixed_views", fixed_views, tracks.n_views),
+        fixed_indices("fixed_points", fixed_points, tracks.n_points),
+    )
+    if isinstance(reconstruction, MetricReconstruction | AffineReconstruction):
         fixed = np.zeros(tracks.n_points, dtype=np.bool_)
-        fixed[fixed_indices("fixed_points", fixed_points, tracks.n_points)] = True
+        fixed[stays[1]] = True
         reference = bool(STRATEGIES[method].reference)
         parts = table, fixed, job.fixes_gauge or reference
         verdict = judged_metric(tracks, reconstruction, outcome, *parts)
     else:
-        verdict = judged(tracks, reconstruction, rejected, loss == "linear", table, workers)
+        how = loss == "linear", table, workers, stays if job.fixes_gauge else None
+        verdict = judged(tracks, reconstruction, rejected, *how)
     unit = job.scale_px**2
     return _result(tracks, reconstruction, outcome, unit, verdict, rejected, method, scale_px)
 
 
 def _result(
     tracks: Tracks,
-    reconstruction: Reconstruction | MetricReconstruction,
+    reconstruction: AnyReconstruction,
     outcome: lm.Outcome[Any],
     unit: float,
     verdict: Verdict,
@@ -349,7 +355,7 @@ def _loss_scale(
     loss: str,
     loss_scale_px: float | str,
     tracks: Tracks,
-    start: Reconstruction | MetricReconstruction,
+    start: AnyReconstruction,
 ) -> float:
     if loss == "linear":
         return 0.0

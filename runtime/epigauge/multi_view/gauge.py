@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from epigauge import kernels
 from epigauge._arguments import as_real
 from epigauge.bundle.similarity import Similarity
-from epigauge.cameras import MetricReconstruction, camera_model
+from epigauge.cameras import AffineReconstruction, MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.tracks import Reconstruction
 from epigauge.scatter import spreading_basis
@@ -142,21 +142,21 @@ class Group:
     names: tuple[str, ...]
 
     def generators(
-        self, reconstruction: Reconstruction | MetricReconstruction
+        self, reconstruction: Reconstruction | MetricReconstruction | AffineReconstruction
     ) -> tuple[Array, Array]:
         """Return the velocities of cameras and points along the group.
 
         Parameters
         ----------
-        reconstruction : Reconstruction or MetricReconstruction
+        reconstruction : Reconstruction, MetricReconstruction or AffineReconstruction
             Where, with cameras of this model.
 
         Returns
         -------
         cameras, points : ndarray, shape (n, d, dimension), (m, b, dimension)
             In each camera's own tangent (turn and move in its own frame, intrinsics; all entries of
-            a projective one) and in the coordinates of each point. The Jacobian of the images times
-            them is zero.
+            a projective one, two rows of an affine one) and in the coordinates of each point. The
+            Jacobian of the images times them is zero.
 
         Raises
         ------
@@ -170,6 +170,8 @@ class Group:
                 reconstruction.vectors,
                 reconstruction.X,
             )
+        elif isinstance(reconstruction, AffineReconstruction):
+            name, rows, points = "affine", reconstruction.vectors, reconstruction.X
         else:
             name, rows, points = "projective", reconstruction.P.reshape(-1, 12), reconstruction.Q
         if name != model.name:
@@ -257,6 +259,10 @@ def transform(reconstruction: MetricReconstruction, T: Similarity) -> MetricReco
 
 
 @overload
+def transform(reconstruction: AffineReconstruction, T: ArrayLike) -> AffineReconstruction: ...
+
+
+@overload
 def transform(
     reconstruction: Reconstruction,
     T: ArrayLike,
@@ -266,25 +272,26 @@ def transform(
 
 
 def transform(
-    reconstruction: Reconstruction | MetricReconstruction,
+    reconstruction: Reconstruction | MetricReconstruction | AffineReconstruction,
     T: ArrayLike | Similarity,
     camera_scales: ArrayLike = 1.0,
     point_scales: ArrayLike = 1.0,
-) -> Reconstruction | MetricReconstruction:
+) -> Reconstruction | MetricReconstruction | AffineReconstruction:
     """Apply a gauge transformation, which changes no projected point.
 
     Parameters
     ----------
-    reconstruction : Reconstruction or MetricReconstruction
+    reconstruction : Reconstruction, MetricReconstruction or AffineReconstruction
         Cameras and points.
     T : array_like, shape (4, 4), or Similarity
-        Change of basis, invertible; of a metric reconstruction a `similarity`.
+        Change of basis, invertible, of an affine reconstruction with the last row 0 0 0 1; of a
+        metric reconstruction a `similarity`.
     camera_scales, point_scales : array_like
-        Factors of each camera and point, or one for all; none zero. Metric ones have none.
+        Factors of each camera and point, or one for all; none zero. Of projective ones only.
 
     Returns
     -------
-    Reconstruction or MetricReconstruction
+    Reconstruction, MetricReconstruction or AffineReconstruction
         P_i' = gamma_i P_i T, Q_j' = alpha_j T^-1 Q_j; or X' = s R X + t, and cameras that see it
         as before.
 
@@ -300,8 +307,7 @@ def transform(
             kind = "metric" if kinds[0] else "projective"
             needed = "eg.gauge.similarity(s, R, t)" if kinds[0] else "a (4, 4) matrix"
             raise ArgumentError("T", f"{what}, the reconstruction {kind}", needed)
-        if not (np.array_equal(camera_scales, 1.0) and np.array_equal(point_scales, 1.0)):
-            raise ArgumentError("camera_scales", "is given", "none for metric reconstructions")
+        _no_scales("metric", camera_scales, point_scales)
         moved, X = T.apply(reconstruction.vectors, reconstruction.X)
         pose = moved[:, :12].reshape(-1, 3, 4)
         return MetricReconstruction(pose[:, :, :3], pose[:, :, 3], X, reconstruction.cameras)
@@ -310,6 +316,12 @@ def transform(
         raise ArgumentError("T", f"has shape {matrix.shape}", "a finite (4, 4) matrix")
     if np.linalg.cond(matrix) > 1e15:
         raise ArgumentError("T", "is singular", "an invertible (4, 4) matrix")
+    if isinstance(reconstruction, AffineReconstruction):
+        _no_scales("affine", camera_scales, point_scales)
+        if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+            raise ArgumentError("T", f"has the last row {matrix[3].tolist()}", "0 0 0 1")
+        there = np.asarray(np.linalg.solve(matrix[:3, :3], (reconstruction.X - matrix[:3, 3]).T)).T
+        return AffineReconstruction(reconstruction.P[:, :2] @ matrix, np.asarray(there))
     scales = []
     for name, value, count in (
         ("camera_scales", camera_scales, len(reconstruction.P)),
@@ -325,6 +337,12 @@ def transform(
     return Reconstruction(
         *Transformation(matrix, *scales).apply(reconstruction.P, reconstruction.Q)
     )
+
+
+def _no_scales(kind: str, camera_scales: ArrayLike, point_scales: ArrayLike) -> None:
+    for name, scales in (("camera_scales", camera_scales), ("point_scales", point_scales)):
+        if not np.array_equal(scales, 1.0):
+            raise ArgumentError(name, "is given", f"none for {kind} reconstructions")
 
 
 def equivalent(a: Reconstruction, b: Reconstruction, tol: float = 1e-8) -> bool:

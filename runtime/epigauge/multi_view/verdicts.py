@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge.bundle.dampings import Covariant
 from epigauge.bundle.diagnosis import diagnosed
+from epigauge.bundle.moves import best_conditioned
 from epigauge.bundle.null_space import generators
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.problem import BundleState, Estimate
 from epigauge.bundle.run import bundle_problem
 from epigauge.bundle.solve import Bordered, BundleSystem, Iterated, reduced_system
-from epigauge.cameras import MetricReconstruction, camera_model
+from epigauge.cameras import AffineReconstruction, MetricReconstruction, camera_model
 from epigauge.kernels import Table
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import normalized
@@ -34,6 +35,7 @@ __all__ = ["BEHIND", "Verdict", "behind", "judged", "judged_metric", "missing_by
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Indices = NDArray[np.intp]
 
 #: Parameters of a camera and a point without their scales, and dimension of the changes of basis.
 _CAMERA, _POINT, _GAUGE = 11, 3, 15
@@ -111,6 +113,7 @@ def judged(
     bends: bool,
     kernels: Table,
     workers: int = 1,
+    fixed: tuple[Indices, Indices] | None = None,
 ) -> Verdict:
     """Judge an adjusted reconstruction.
 
@@ -128,6 +131,8 @@ def judged(
         Backend.
     workers : int
         Threads.
+    fixed : tuple of ndarray of int, optional
+        Views and points that are no unknowns.
 
     Returns
     -------
@@ -144,6 +149,12 @@ def judged(
         return Verdict(("undetermined",), 0, n_behind)
     of_cameras, of_points, weakest = _open_directions(seen, Frame.of(tracks), kernels, workers)
     of_cameras = max(missing_by_count(seen), of_cameras) + _CAMERA * lost
+    views, points = (len(part) for part in fixed or ((), ()))
+    if fixed is not None:
+        full -= _CAMERA * views + _POINT * points
+        full += _GAUGE - missing_beside((found.P[fixed[0]], found.Q[fixed[1]]))
+    if views == len(found.P):
+        of_cameras, weakest = 0, 1.0
     N = len(distances)
     redundancy = max(2 * N - full, 1) / (2 * N)
     # Of two normal coordinates, the median distance is 1.1774 standard deviations.
@@ -152,7 +163,8 @@ def judged(
     deviation = noise_px / Frame.of(tracks).scale / float(np.sqrt(information))
     # Where the fit is bad, nothing is within its noise.
     fits = noise_px < _FITS * Frame.of(tracks).scale
-    raised = set(parallax_flags(seen, noise_px)) if fits else set()
+    judge = fits and views < len(found.P)
+    raised = set(parallax_flags(seen, noise_px)) if judge else set()
     extent = _extent(seen.xy)
     usual = _HEAVY * max(noise_px, _EXACT * extent)
     heavy = float(np.sqrt(np.mean(distances**2) / 2.0)) > usual
@@ -177,19 +189,19 @@ def _extent(xy: Array) -> float:
 
 def judged_metric(
     tracks: Tracks,
-    found: MetricReconstruction,
+    found: MetricReconstruction | AffineReconstruction,
     outcome: lm.Outcome[BundleState],
     kernels: Table,
     known: Mask,
     fixes_gauge: bool,
 ) -> Verdict:
-    """Judge an adjusted metric reconstruction.
+    """Judge an adjusted metric or affine reconstruction.
 
     Parameters
     ----------
     tracks : Tracks
         Observations.
-    found : MetricReconstruction
+    found : MetricReconstruction or AffineReconstruction
         Cameras and points, at the minimum.
     outcome : Outcome
         How the minimisation ended.
@@ -206,7 +218,10 @@ def judged_metric(
         Flags, rank, condition and weakest direction, and the number of observations that are not in
         front of their camera.
     """
-    n_behind = int(np.count_nonzero(~(found.depths(tracks) > 0.0)))
+    # Affine cameras have no front.
+    n_behind, metric = 0, False
+    if isinstance(found, MetricReconstruction):
+        n_behind, metric = int(np.count_nonzero(~(found.depths(tracks) > 0.0))), True
     raised = ["behind the cameras"] if n_behind > BEHIND * len(tracks) else []
     system, rank = outcome.system, 0
     condition, weakest = float("inf"), ""
@@ -217,11 +232,45 @@ def judged_metric(
         noise_px = np.sqrt(2.0 * outcome.state.cost / max(counted, 1))
         deviations = noise_px * np.abs(diagnosis.cameras)
         weakest, share = _named(system, deviations)
-        if diagnosis.missing:
+        flat = 0.0 if metric else _flatness(found, noise_px * Frame.of(tracks).scale)
+        if diagnosis.missing or flat > 1.0:
             raised.append("undetermined")
-        elif share > _UNCERTAIN:
+        elif flat > _WEAK or share > _UNCERTAIN:
             raised.append("weak geometry")
     return Verdict(ordered(raised), rank, n_behind, condition, weakest)
+
+
+def _flatness(found: MetricReconstruction | AffineReconstruction, noise_px: float) -> float:
+    """Return what noise alone would spread the images of a flat scene in depth, over what does.
+
+    The third singular value of the measurements of affine cameras over that of noise, whose largest
+    one is the sum of the roots of both sizes.
+    """
+    moved = best_conditioned(camera_model("affine"), found.P.reshape(-1, 12), found.X)
+    P = moved.apply(found.P.reshape(-1, 12), found.X)[0].reshape(-1, 3, 4)
+    rows, m = P[:, :2, :3].reshape(-1, 3), len(found.X)
+    third = float(np.linalg.svd(rows, compute_uv=False)[2]) * np.sqrt(m)
+    return float(noise_px * (np.sqrt(len(rows)) + np.sqrt(m)) / max(third, 1e-300))
+
+
+def missing_beside(fixed: tuple[Array, Array]) -> int:
+    """Return the dimension of the changes of basis that leave cameras and points, up to scale.
+
+    Parameters
+    ----------
+    fixed : tuple of ndarray, shape (k, 3, 4), (l, 4)
+        The cameras and points.
+    """
+    P, Q = fixed
+    rows = [np.zeros((0, 16))]
+    for camera in P / np.linalg.norm(P, axis=(1, 2), keepdims=True):
+        linear = np.kron(camera, np.eye(4))  # of vect(E) to vect(P E)
+        rows.append(linear - np.outer(camera.ravel(), camera.ravel() @ linear))
+    for point in Q / np.linalg.norm(Q, axis=1, keepdims=True):
+        linear = np.kron(np.eye(4), point)  # of vect(E) to E Q
+        rows.append(linear - np.outer(point, point @ linear))
+    # E = I moves nothing.
+    return 15 - int(np.linalg.matrix_rank(np.concatenate(rows), tol=1e-9))
 
 
 def _named(system: BundleSystem, deviations: Array) -> tuple[str, float]:
@@ -229,18 +278,12 @@ def _named(system: BundleSystem, deviations: Array) -> tuple[str, float]:
 
     Turns are in radians, moves as shares of the median distance of the points, focal lengths and
     other parameters in their unit as shares of the focal length; all others count for nothing.
+    Affine cameras are as they are computed with: points of unit covariance, images of RMS one.
     """
-    model, cameras = system.model, system.cameras
-    pose = cameras[:, :12].reshape(-1, 3, 4)
-    centres = -np.einsum("nji,nj->ni", pose[:, :, :3], pose[:, :, 3])
-    extent = np.median(np.linalg.norm(system.points - centres.mean(axis=0), axis=1))
+    model = system.model
     sizes = np.ones(deviations.shape)
-    sizes[:, 3:6] = max(float(extent), 1e-300)
-    focal = cameras[:, 12:][:, list(model.focal)]
-    sizes[:, 6:] = focal.mean(axis=1, keepdims=True) if focal.size else np.inf
-    of_image = {model.units[k] for k in model.focal}
-    without = [k for k in range(len(model.adjusted)) if model.units[k] not in of_image]
-    sizes[:, [6 + k for k in without]] = np.inf
+    if model.metric:
+        _set_sizes(sizes, system)
     shares = deviations / sizes
     views, entries = np.unravel_index(np.argsort(-shares, axis=None)[:3], shares.shape)
     told = [
@@ -248,6 +291,20 @@ def _named(system: BundleSystem, deviations: Array) -> tuple[str, float]:
         for i, k in zip(views, entries, strict=True)
     ]
     return ", ".join(told), float(shares.max())
+
+
+def _set_sizes(sizes: Array, system: BundleSystem) -> None:
+    """Set the sizes (n, d) of a metric camera's own tangents."""
+    model, cameras = system.model, system.cameras
+    pose = cameras[:, :12].reshape(-1, 3, 4)
+    centres = -np.einsum("nji,nj->ni", pose[:, :, :3], pose[:, :, 3])
+    extent = np.median(np.linalg.norm(system.points - centres.mean(axis=0), axis=1))
+    sizes[:, 3:6] = max(float(extent), 1e-300)
+    focal = cameras[:, 12:][:, list(model.focal)]
+    sizes[:, 6:] = focal.mean(axis=1, keepdims=True) if focal.size else np.inf
+    of_image = {model.units[k] for k in model.focal}
+    without = [k for k in range(len(model.adjusted)) if model.units[k] not in of_image]
+    sizes[:, [6 + k for k in without]] = np.inf
 
 
 def missing_by_count(seen: Seen) -> int:
