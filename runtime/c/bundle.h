@@ -154,6 +154,7 @@ typedef struct {
     const ptrdiff_t *passes;  /* (n_passes + 1): edges of the threads' ranges of chunks */
     const ptrdiff_t *pairs;   /* (n_pairs + 1): the same for passes over pairs of observations */
     const volatile int *stop; /* the loop ends before its next step where this is not zero */
+    int adaptive;             /* whether lambda follows the gain ratio once a step was rejected */
 } eg_bundle_options;
 
 /* The normal equations at the end, as of `eg_bundle_linearize` and `eg_bundle_camera_blocks`. */

@@ -281,6 +281,34 @@ static int make_step(void *self, double lam, double *norm)
     return s->failed ? EG_STEP_HOPELESS : EG_STEP_MADE;
 }
 
+/* The decrease that the quadratic model promises for the step, with (N + lam D) step = -g:
+   (lam step^T D step - g^T step) / 2. */
+static double promised(void *self)
+{
+    const state *s = self;
+    const ptrdiff_t d = s->d, b = s->b;
+    double slope = 0.0, energy = 0.0;
+    for (ptrdiff_t i = 0; i < s->n; ++i)
+        for (ptrdiff_t k = 0; k < d; ++k) {
+            const double *row = s->D + d * (d * i + k), *step = s->step + d * i;
+            double damped = 0.0;
+            for (ptrdiff_t l = 0; l < d; ++l)
+                damped += row[l] * step[l];
+            slope += s->g[d * i + k] * step[k];
+            energy += damped * step[k];
+        }
+    for (ptrdiff_t j = 0; j < s->m; ++j)
+        for (ptrdiff_t k = 0; k < b; ++k) {
+            const double *step = s->point_step + b * j;
+            double damped = s->route.factored ? 0.0 : s->D_points[j] * step[k];
+            for (ptrdiff_t l = 0; s->route.factored && l < b; ++l)
+                damped += s->D_points[b * (b * j + k) + l] * step[l];
+            slope += s->g_points[b * j + k] * step[k];
+            energy += damped * step[k];
+        }
+    return 0.5 * (s->lam * energy - slope);
+}
+
 static void refine_part(void *self, ptrdiff_t k)
 {
     state *s = self;
@@ -346,7 +374,7 @@ int eg_bundle_minimize(
     for (size_t k = 0; k < kinds; next += (parts[k].size + 7) / 8 * 8, ++k)
         *parts[k].part = next;
     const eg_lm_problem problem = {&s, options->floor, cost_at_start, linearize, make_step,
-                                   cost_at_trial, accept};
+                                   cost_at_trial, accept, options->adaptive ? promised : NULL};
     const eg_lm_options how = {options->ftol, options->xtol, options->gtol, options->start,
                                options->least, 0, (int)options->max_iter};
     eg_lm_outcome outcome;

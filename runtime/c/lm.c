@@ -22,6 +22,37 @@ static double now(void)
 #endif
 }
 
+/* Lambda, and how the next one is chosen: by a constant factor, then, once a step has been rejected
+   and promises are known, by the gain ratio with a growth that doubles (Nielsen). */
+typedef struct {
+    double lam, growth;
+    int smooth;
+} schedule;
+
+static void rejected(schedule *s, const eg_lm_problem *problem)
+{
+    if (s->smooth) {
+        s->lam *= s->growth;
+        s->growth *= 2.0;
+        return;
+    }
+    s->lam *= LAM_FACTOR;
+    s->smooth = problem->promised != NULL;
+    s->growth = 2.0;
+}
+
+static void accepted(schedule *s, const eg_lm_problem *problem, double decrease)
+{
+    if (!s->smooth) {
+        s->lam /= LAM_FACTOR;
+        return;
+    }
+    const double promised = problem->promised(problem->self);
+    const double gain = 2.0 * (promised > 0.0 ? decrease / promised : 1.0) - 1.0;
+    s->growth = 2.0;
+    s->lam *= fmax(1.0 / 3.0, 1.0 - gain * gain * gain);
+}
+
 static double finite_or_infinity(double cost)
 {
     return isfinite(cost) ? cost : INFINITY;
@@ -54,8 +85,8 @@ static int loop(const eg_lm_problem *problem, const eg_lm_options *options, doub
     outcome->njev = 1;
     if (!isfinite(outcome->cost))
         return -3;
-    double lam = options->start * (options->relative ? fmax(system.size, TINIEST) : 1.0);
-    const double least = options->floor * lam;
+    schedule next = {options->start * (options->relative ? fmax(system.size, TINIEST) : 1.0), 2.0, 0};
+    const double least = options->floor * next.lam;
     for (;;) {
         double trial = 0.0, decrease = 0.0, norm = 0.0;
         if (outcome->cost <= problem->floor)
@@ -68,24 +99,25 @@ static int loop(const eg_lm_problem *problem, const eg_lm_options *options, doub
         for (;;) {
             if (outcome->nit >= options->max_iter)
                 return 0;
-            const int made = problem->step(self, lam, &norm);
+            const int made = problem->step(self, next.lam, &norm);
             if (made == EG_STEP_HOPELESS)
                 return -1;
             if (made == EG_STEP_MADE) {
                 outcome->nit += 1;
                 trial = finite_or_infinity(problem->cost_at_trial(self));
                 decrease = outcome->cost - trial;
-                record(history, outcome, trial, lam, norm, decrease > 0.0, begun);
+                record(history, outcome, trial, next.lam, norm, decrease > 0.0, begun);
                 if (decrease > 0.0)
                     break;
                 if (fabs(decrease) <= 1e-15 * outcome->cost)
                     return 2;
             }
-            lam *= LAM_FACTOR;
-            if (!(lam <= ceiling))
+            rejected(&next, problem);
+            if (!(next.lam <= ceiling))
                 return -1;
         }
-        lam = fmax(lam / LAM_FACTOR, least);
+        accepted(&next, problem, decrease);
+        next.lam = fmax(next.lam, least);
         outcome->cost = trial;
         problem->accept(self);
         system = problem->linearize(self);

@@ -26,6 +26,9 @@ typedef struct {
     int (*step)(void *self, double lam, double *norm);
     double (*cost_at_trial)(void *self);
     void (*accept)(void *self);
+    /* The decrease that the step last made promises. Where it is known, the schedule is lm.py's
+       Adaptive; where this is NULL, Classic. */
+    double (*promised)(void *self);
 } eg_lm_problem;
 
 typedef struct {

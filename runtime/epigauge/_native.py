@@ -125,6 +125,7 @@ class BundleOptions(ctypes.Structure):
         ("passes", _P),
         ("pairs", _P),
         ("stop", _P),
+        ("adaptive", _I),
     )
 
 

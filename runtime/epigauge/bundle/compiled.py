@@ -92,6 +92,7 @@ def minimized(
         address(passes),
         address(pairs),
         ctypes.addressof(stop),
+        type(schedule) is lm.Adaptive,
     )
     blocks = np.empty((n, d, d)), np.empty((m, b, b)), np.empty((n, d)), np.empty((m, b))
     normal = NormalArrays(*map(address, blocks))
