@@ -241,10 +241,10 @@ class TestDegenerateScenes:
 
 
 class TestHonesty:
-    @pytest.mark.parametrize("ftol", [1e-3, 1e-4, 1e-5, 1e-6])
+    @pytest.mark.parametrize("ftol", [1e-3, 1e-6, 1e-10])
     def test_joint_solution_with_stuck_points_is_no_success(self, ftol) -> None:
         view = eg.two_view_scene(10, seed=1)
-        # The cost creeps: below 1e-6 the loop would go on for thousands of steps (status 0).
+        # The cost creeps: below 1e-6 the steps run out.
         options = {"structure": "joint", "max_iter": 300}
         result = eg.refine_fundamental(view.x1, view.x2, np.eye(3), ftol=ftol, **options)
         assert result.status == -4
@@ -252,6 +252,12 @@ class TestHonesty:
         assert "start" in result.message
         # What it warns of: other points for the same F cost far less.
         assert result.cost > 10.0 * (0.5 * np.sum(result.fun**2))
+
+    def test_points_on_their_way_are_not_stuck(self) -> None:
+        view = eg.two_view_scene(10, seed=1)
+        for max_iter in (1, 2, 3):
+            options = {"structure": "joint", "max_iter": max_iter, "ftol": 0.0}
+            assert eg.refine_fundamental(view.x1, view.x2, **options).status == 0
 
     def test_match_on_both_epipoles_of_the_start_does_not_stop_the_others(self) -> None:
         view = eg.two_view_scene(4, motion="forward", seed=1)

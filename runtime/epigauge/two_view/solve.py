@@ -52,6 +52,9 @@ _SCALE_ROUNDS = 10
 #: Joint solutions whose cost exceeds that of the best points by more than this did not converge.
 _SETTLED = 1e-6
 
+#: The same where the number of steps ran out.
+_STUCK = 1e-2
+
 
 @dataclass(frozen=True)
 class Options:
@@ -245,7 +248,7 @@ def _minimize_once(
     else:
         motion = outcome.state.motion
     F = chart.fundamental(motion)
-    if outcome.status > 0 and not isinstance(problem, EliminatedProblem):
+    if outcome.status >= -1 and not isinstance(problem, EliminatedProblem):
         outcome = replace(outcome, status=_settled(matches, F, loss, outcome))
     return Solution(F, chart, motion, outcome, scale_px)
 
@@ -266,12 +269,21 @@ def _settled(matches: Matches, F: Array, loss: Loss, outcome: lm.Outcome[Any]) -
     """Return the status, corrected where points are left far from the best ones for this F.
 
     A point that crosses a focal plane or starts near an epipole can hold up all the others; the
-    steps, though short, are then no sign of convergence.
+    steps, though short, are then no sign of convergence. Where the number of steps ran out, that is
+    so if the points have more to gain than the second half of the steps did.
     """
     rho, _, _ = loss(matches.reprojection().evaluate(F).squared)
     lowest = 0.5 * float(np.sum(matches.weights * rho))
     rounding = 1e-24 * float(np.sum(matches.weights))
-    return outcome.status if outcome.state.cost <= lowest * (1.0 + _SETTLED) + rounding else -4
+    gap = outcome.state.cost - lowest
+    if gap <= _SETTLED * lowest + rounding:
+        return outcome.status
+    if outcome.status == 0:
+        rows = outcome.history[: max(len(outcome.history) // 2, 1)]
+        before = min(row.cost for row in rows if row.accepted) / matches.frame.scale**2
+        if gap <= max(before - outcome.state.cost, _STUCK * lowest):
+            return 0
+    return -4
 
 
 def _chart(matches: Matches, options: Options, start: Array) -> Parameterization:
