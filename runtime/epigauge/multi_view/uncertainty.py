@@ -26,7 +26,7 @@ from epigauge.lengths import linear_length
 from epigauge.multi_view.datum import Projector, freedom, halves, mapped, projector
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import Gauge, identity, normalized, two_cameras
-from epigauge.multi_view.sandwich import Sandwich, influence
+from epigauge.multi_view.sandwich import RobustFit, Sandwich
 from epigauge.multi_view.tracks import Reconstruction, Tracks
 from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
 
@@ -251,7 +251,8 @@ def covariance(
     noise_px : float, optional
         Standard deviation of an image coordinate of weight one. By default estimated from the
         residuals: sqrt(sum of weighted squares / (2 N - 11 n - 3 m + 15)), with a robust loss over
-        those within three standard deviations (`epigauge.multi_view.sandwich.influence`).
+        those within three standard deviations, freed from the pull of the others
+        (`epigauge.multi_view.sandwich.RobustFit`).
     loss : {"linear", "huber", "soft_l1", "cauchy", "truncated"}
         What the reconstruction was adjusted with. Under a robust loss the covariance is that of an
         M-estimate, A^-1 B A^-1, with wrong observations counted one by one.
@@ -296,7 +297,7 @@ def covariance(
     found, weights = None, np.asarray(tracks.weights)
     if as_choice("loss", loss, LOSSES) != "linear":
         robust = _robust(tracks, reconstruction, loss, loss_scale_px)
-        found = influence(*robust, 11 * n + 3 * m - 15)
+        found = RobustFit.of(*robust, 11 * n + 3 * m - 15)
         weights = found.weights
     parts = camera_model("projective"), table, graph, q, weights
     linearizer = NumpyLinearizer(*parts, Loss())
@@ -305,14 +306,18 @@ def covariance(
     cost = 0.5 * float(np.sum(linearizer.point_costs(*state)))
     if noise_px is not None:
         noise_px = as_positive("noise_px", noise_px)
-    elif found is not None:
-        noise_px = found.noise
-    else:
+    elif found is None:
         redundancy = 2 * int(np.count_nonzero(tracks.weights)) - 11 * n - 3 * m + 15
         if redundancy <= 0:
             raise ArgumentError("noise_px", "is not given", "a number: nothing is redundant")
         noise_px = frame.scale * float(np.sqrt(2.0 * cost / redundancy))
     inverse = Inverse.of(linearizer, state, frame.scale)
+    whole: Inverse | Sandwich = inverse
+    if found is not None:
+        influence = found.influence(inverse.pull(found.wrong, found.psi))
+        noise_px = influence.noise if noise_px is None else noise_px
+        whole = Sandwich(inverse, influence)
+    assert noise_px is not None
     # From whitened parameters at home to the reconstruction as given, in pixels.
     cameras, points = home.inverse().blocks()
     pixels = np.zeros((n, 3, 3))
@@ -320,7 +325,6 @@ def covariance(
     pixels[:, :2, 2], pixels[:, 2, 2] = frame.origins, 1.0
     out = np.einsum("nij,kl->nikjl", pixels, np.eye(4)).reshape(n, 12, 12)
     maps = (out @ cameras @ inverse.whitening[0], points @ inverse.whitening[1])
-    whole = inverse if found is None else Sandwich(inverse, found)
     free = ReconstructionCovariance(
         reconstruction, noise_px, projector(identity(), P, Q), whole, maps
     )
@@ -487,6 +491,21 @@ class Inverse:
         found = J_camera @ X_ii @ np.swapaxes(J_camera, 1, 2)
         found = found + J_point @ X_jj @ np.swapaxes(J_point, 1, 2)
         return np.asarray(found + mixed + np.swapaxes(mixed, 1, 2))
+
+    def pull(self, observations: Indices, psi: Array) -> Array:
+        """Return how far residuals (N, 2) move when forces psi (k, 2) on some are taken off."""
+        layout = self.layout
+        views, points = layout.view[observations], layout.point[observations]
+        J_camera, J_point = self.jacobians(views, points)
+        cameras, own = np.zeros((layout.n_views, 12)), np.zeros((layout.n_points, 4))
+        np.add.at(cameras, views, np.einsum("kij,ki->kj", J_camera, psi))
+        np.add.at(own, points, np.einsum("kij,ki->kj", J_point, psi))
+        moved = self.apply(np.concatenate([cameras.ravel(), own.ravel()])[:, None])[:, 0]
+        J_camera, J_point = self.jacobians(layout.view, layout.point)
+        x = moved[: cameras.size].reshape(-1, 12)[layout.view]
+        y = moved[cameras.size :].reshape(-1, 4)[layout.point]
+        moves = np.einsum("kij,kj->ki", J_camera, x) + np.einsum("kij,kj->ki", J_point, y)
+        return np.asarray(moves)
 
     def jacobians(self, views: Indices, points: Indices) -> tuple[Array, Array]:
         """Return derivatives (k, 2, 12), (k, 2, 4) of points in views, by whitened parameters."""
