@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge import casadi, colmap, datasets, interop, kernels, verdicts
-    from epigauge.bundle.priors import IntrinsicPrior, PointPrior, PositionPrior
+    from epigauge.bundle.priors import Distance, IntrinsicPrior, PointPrior, PositionPrior
     from epigauge.cameras import AffineReconstruction, Cameras, MetricReconstruction
     from epigauge.errors import ArgumentError, BackendError, EpigaugeError, FileFormatError
     from epigauge.images import ImageMatches, load_image, match_images
@@ -59,6 +59,7 @@ __all__ = [
     "BundleResult",
     "Cameras",
     "Comparison",
+    "Distance",
     "EpigaugeError",
     "FileFormatError",
     "FundamentalBatch",
@@ -116,7 +117,7 @@ __all__ = [
 
 #: Modules below this package, and the public names that they define.
 _WHERE = {
-    "bundle.priors": "IntrinsicPrior PointPrior PositionPrior",
+    "bundle.priors": "Distance IntrinsicPrior PointPrior PositionPrior",
     "cameras": "AffineReconstruction Cameras MetricReconstruction",
     "errors": "ArgumentError BackendError EpigaugeError FileFormatError",
     "images": "ImageMatches load_image match_images",

@@ -56,6 +56,8 @@ class Job:
         What is known beside the images.
     fixes_gauge : bool
         Whether something fixed or known ties the reconstruction to its frame.
+    stretch : ndarray, shape (2, N), or None
+        Factors of the two coordinates of a residual, where they are not measured alike.
     """
 
     model: CameraModel
@@ -67,6 +69,7 @@ class Job:
     freedom: Freedom = field(default_factory=Freedom)
     priors: Priors | None = None
     fixes_gauge: bool = False
+    stretch: Array | None = None
 
 
 def job_of(
@@ -148,6 +151,7 @@ def uncalibrated_job(
         whole_freedom(model, len(rows), len(points), views, held),
         None,
         bool(len(views) + len(held)),
+        tracks.stretch,
     )
 
 
@@ -175,7 +179,7 @@ def metric_job(
         listed = list(priors or ())
     except TypeError:
         raise ArgumentError("priors", f"is {priors!r:.60}", "a list of priors") from None
-    known = Priors.of(listed, start)
+    known = Priors.of(listed, start).weighted(tracks.unit**2)
 
     def result(cameras: Array, X: Array) -> MetricReconstruction:
         # What was fixed comes back as it was, to the last bit.
@@ -192,7 +196,8 @@ def metric_job(
         result,
         refined_freedom(start, refine, views, points, listed),
         known if len(known) else None,
-        bool(len(views) + len(points) + len(known.views) + len(known.points)),
+        bool(len(views) + len(points) + len(known) - len(known.cameras)),
+        tracks.stretch,
     )
 
 

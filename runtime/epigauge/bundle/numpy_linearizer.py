@@ -48,6 +48,8 @@ class NumpyLinearizer:
         Factor of each squared residual.
     loss : Loss
         Applied to each squared residual.
+    stretch : ndarray, shape (2, N), or None
+        Factors of a residual's coordinates, where they are not measured alike.
     """
 
     model: CameraModel
@@ -56,6 +58,7 @@ class NumpyLinearizer:
     q: Array
     weights: Array
     loss: Loss
+    stretch: Array | None = None
 
     def with_loss(self, loss: Loss) -> NumpyLinearizer:
         """Return the same observations with another loss."""
@@ -68,10 +71,16 @@ class NumpyLinearizer:
             return np.asarray(residual(*self._gathered(cameras, points), self.q))
 
     def observe(self, cameras: Array, points: Array) -> tuple[Array, Array, Array]:
-        """Return r (2, N), and the Jacobians of q_hat by camera (2, d, N) and point (2, b, N)."""
+        """Return r (2, N), and the Jacobians of q_hat by camera (2, d, N) and point (2, b, N).
+
+        All are stretched.
+        """
         observe = self._kernel("observe")
         with np.errstate(**_QUIET):
             r, J_camera, J_point = observe(*self._gathered(cameras, points), self.q)
+            if self.stretch is not None:
+                each = self.stretch[:, None]
+                r, J_camera, J_point = self.stretch * r, each * J_camera, each * J_point
         return r, J_camera, J_point
 
     def log_depths(self, cameras: Array, points: Array) -> tuple[Array, Array]:
@@ -84,7 +93,8 @@ class NumpyLinearizer:
     def point_costs(self, cameras: Array, points: Array) -> Array:
         """Return the weighted robust sum of each point, (m,); not finite in a focal plane."""
         with np.errstate(**_QUIET):
-            return self._costs(self.residuals(cameras, points))[0]
+            r = self.residuals(cameras, points)
+            return self._costs(r if self.stretch is None else self.stretch * r)[0]
 
     def distances(self, cameras: Array, points: Array) -> Array:
         """Return the distance of each observation to its projected point, (N,), in any order."""

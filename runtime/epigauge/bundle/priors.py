@@ -1,8 +1,8 @@
-"""Gaussian priors on positions, intrinsics and points: what is known beside the images.
+"""Gaussian priors on positions, intrinsics, points and distances: what is known beside the images.
 
 Each adds 0.5 e^T covariance^-1 e to the cost, e the deviation from what is known. Observations
-count as if measured with one pixel (and weight one): give `sigma` divided by the noise of the
-image, in pixels, where that is not one.
+count with the `sigma` of the tracks; without one, as if measured with one pixel (and weight one):
+give priors a `sigma` divided by the noise of the image, in pixels, where that is not one.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from epigauge._arguments import as_real
 from epigauge.bundle.linearizer import Normal
 from epigauge.bundle.similarity import Similarity
+from epigauge.bundle.solve import Border
 from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 
-__all__ = ["IntrinsicPrior", "PointPrior", "PositionPrior", "Prior", "Priors"]
+__all__ = ["Distance", "IntrinsicPrior", "PointPrior", "PositionPrior", "Prior", "Priors"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -99,7 +100,31 @@ class PointPrior:
     covariance: ArrayLike | None = None
 
 
-Prior = PositionPrior | IntrinsicPrior | PointPrior
+@dataclass(frozen=True)
+class Distance:
+    """The distance of two points is known, as of a scale bar.
+
+    Parameters
+    ----------
+    point1, point2 : int
+        Which.
+    length, sigma : float
+        Distance and standard deviation, in the unit of the start.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.Distance(3, 8, length=1389.688, sigma=0.01).length
+    1389.688
+    """
+
+    point1: int
+    point2: int
+    length: float
+    sigma: float
+
+
+Prior = PositionPrior | IntrinsicPrior | PointPrior | Distance
 
 
 @dataclass(frozen=True)
@@ -117,6 +142,10 @@ class Priors:
         counts once.
     params, values, precisions : ndarray, shape (j,)
         Which parameter, its value and inverse variance.
+    ends : ndarray of int, shape (d, 2)
+        Points whose distance is known.
+    lengths, length_precisions : ndarray, shape (d,)
+        Their distances, and inverse variances.
     """
 
     views: Indices
@@ -129,6 +158,9 @@ class Priors:
     params: Indices
     values: Array
     precisions: Array
+    ends: Indices
+    lengths: Array
+    length_precisions: Array
 
     @staticmethod
     def of(priors: Sequence[Prior], start: MetricReconstruction) -> Priors:
@@ -143,6 +175,7 @@ class Priors:
         names = camera_model(start.cameras.model).adjusted
         places: dict[type, list[tuple[int, Array, Array]]] = {PositionPrior: [], PointPrior: []}
         intrinsics: list[tuple[int, int, float, float]] = []
+        distances: list[tuple[int, int, float, float]] = []
         for number, prior in enumerate(priors):
             what = f"priors[{number}]"
             if isinstance(prior, PositionPrior):
@@ -157,22 +190,48 @@ class Priors:
                     known = f"one of {', '.join(names)}" if names else "none: it has no parameters"
                     raise ArgumentError(f"{what}.name", f"is {prior.name!r:.60}", known)
                 value = _number(f"{what}.value", prior.value)
-                sigma = _number(f"{what}.sigma", prior.sigma)
-                if not sigma > 0.0:
-                    raise ArgumentError(f"{what}.sigma", f"is {sigma}", "a positive number")
+                sigma = _positive(f"{what}.sigma", prior.sigma)
                 first = int(np.argmax(start.cameras.camera_of_view == camera))
                 intrinsics.append((first, names.index(prior.name), value, sigma**-2))
+            elif isinstance(prior, Distance):
+                ends = [
+                    _index(f"{what}.point{k}", point, start.n_points)
+                    for k, point in ((1, prior.point1), (2, prior.point2))
+                ]
+                if np.array_equal(start.X[ends[0]], start.X[ends[1]]):
+                    raise ArgumentError(what, "is between points at one place", "points apart")
+                length = _positive(f"{what}.length", prior.length)
+                sigma = _positive(f"{what}.sigma", prior.sigma)
+                distances.append((ends[0], ends[1], length, sigma**-2))
             else:
-                kinds = "eg.PositionPrior, eg.IntrinsicPrior or eg.PointPrior"
+                kinds = "eg.PositionPrior, eg.IntrinsicPrior, eg.PointPrior or eg.Distance"
                 raise ArgumentError(what, f"is a {type(prior).__name__}", kinds)
         j = np.array([row[:2] for row in intrinsics], np.intp).reshape(-1, 2)
         v = np.array([row[2:] for row in intrinsics]).reshape(-1, 2)
         stacked = _stacked(places[PositionPrior]), _stacked(places[PointPrior])
-        return Priors(*stacked[0], *stacked[1], j[:, 0], j[:, 1], v[:, 0], v[:, 1])
+        ends = np.array([row[:2] for row in distances], np.intp).reshape(-1, 2)
+        of_ends = np.array([row[2:] for row in distances]).reshape(-1, 2)
+        parts = j[:, 0], j[:, 1], v[:, 0], v[:, 1], ends, of_ends[:, 0], of_ends[:, 1]
+        return Priors(*stacked[0], *stacked[1], *parts)
 
     def __len__(self) -> int:
         """Return how many there are."""
-        return len(self.views) + len(self.points) + len(self.cameras)
+        return len(self.views) + len(self.points) + len(self.cameras) + len(self.ends)
+
+    @property
+    def n_numbers(self) -> int:
+        """Return how many numbers are known."""
+        return 3 * (len(self.views) + len(self.points)) + len(self.cameras) + len(self.ends)
+
+    def weighted(self, weight: float) -> Priors:
+        """Return the same where observations of weight one have the variance `weight`."""
+        return replace(
+            self,
+            view_information=weight * self.view_information,
+            point_information=weight * self.point_information,
+            precisions=weight * self.precisions,
+            length_precisions=weight * self.length_precisions,
+        )
 
     def moved(self, there: Similarity) -> Priors:
         """Return the same in another frame, moved as the reconstruction is."""
@@ -182,6 +241,8 @@ class Priors:
             places=there.positions(self.places),
             view_information=there.information(self.view_information),
             point_information=there.information(self.point_information),
+            lengths=there.scale * self.lengths,
+            length_precisions=self.length_precisions / there.scale**2,
         )
 
     def cost(self, cameras: Array, points: Array) -> float:
@@ -189,6 +250,8 @@ class Priors:
         c, x, k = self._deviations(cameras, points)
         total = np.einsum("ki,kij,kj->", c, self.view_information, c)
         total = total + np.einsum("ki,kij,kj->", x, self.point_information, x)
+        away = self._along(points)[1] - self.lengths
+        total = total + np.sum(self.length_precisions * away**2)
         return 0.5 * float(total + np.sum(self.precisions * k**2))
 
     def added(self, normal: Normal, cameras: Array, points: Array) -> Normal:
@@ -207,7 +270,54 @@ class Priors:
         np.add.at(g_cameras, (self.cameras, 6 + self.params), self.precisions * k)
         np.add.at(V, self.points, self.point_information)
         np.add.at(g_points, self.points, np.einsum("kij,kj->ki", self.point_information, x))
+        along, lengths = self._along(points)
+        pull = (self.length_precisions * (lengths - self.lengths))[:, None] * along
+        np.add.at(g_points, self.ends[:, 0], pull)
+        np.add.at(g_points, self.ends[:, 1], -pull)
         return replace(normal, U=U, V=V, g_cameras=g_cameras, g_points=g_points)
+
+    def border(self, n: int, d: int, points: Array) -> Border | None:
+        """Return what known distances add to J^T J: they couple points."""
+        if not len(self.ends):
+            return None
+        count = len(self.ends)
+        columns = np.zeros((len(points), 3, count))
+        along = np.sqrt(self.length_precisions)[:, None] * self._along(points)[0]
+        columns[self.ends[:, 0], :, np.arange(count)] = along
+        columns[self.ends[:, 1], :, np.arange(count)] = -along
+        return Border(np.zeros((n, d, count)), columns)
+
+    def slopes(
+        self, cameras: Array, points: Array, of_cameras: Array, of_points: Array
+    ) -> Array:
+        """Return how what is known changes with motions, unweighted.
+
+        Parameters
+        ----------
+        cameras, points : ndarray, shape (n, c), (m, 3)
+            The estimate.
+        of_cameras, of_points : ndarray, shape (n, d, g), (m, 3, g)
+            Motions of the gauge, as own tangents.
+
+        Returns
+        -------
+        ndarray, shape (k, g)
+            Rows: three a place, one any other number.
+        """
+        R = cameras[self.views, :12].reshape(-1, 3, 4)[:, :, :3]
+        centres = np.swapaxes(R, 1, 2) @ of_cameras[self.views, 3:6]
+        g = of_points.shape[2]
+        blocks = [centres.reshape(-1, g), of_points[self.points].reshape(-1, g)]
+        blocks.append(of_cameras[self.cameras, 6 + self.params])
+        apart = of_points[self.ends[:, 0]] - of_points[self.ends[:, 1]]
+        blocks.append(np.einsum("ki,kig->kg", self._along(points)[0], apart))
+        return np.concatenate(blocks)
+
+    def _along(self, points: Array) -> tuple[Array, Array]:
+        """Return unit vectors from the second to the first end, and their distances."""
+        apart = points[self.ends[:, 0]] - points[self.ends[:, 1]]
+        lengths = np.linalg.norm(apart, axis=1)
+        return apart / np.maximum(lengths, 1e-300)[:, None], lengths
 
     def _deviations(self, cameras: Array, points: Array) -> tuple[Array, Array, Array]:
         pose = cameras[self.views, :12].reshape(-1, 3, 4)
@@ -237,6 +347,13 @@ def _number(name: str, value: Any) -> float:
     if array.ndim or not np.isfinite(array):
         raise ArgumentError(name, f"is {value!r:.60}", "a finite number")
     return float(array)
+
+
+def _positive(name: str, value: Any) -> float:
+    number = _number(name, value)
+    if not number > 0.0:
+        raise ArgumentError(name, f"is {number}", "a positive number")
+    return number
 
 
 def _gaussian(what: str, prior: PositionPrior | PointPrior) -> tuple[Array, Array]:

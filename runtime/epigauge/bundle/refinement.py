@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.bundle.freedom import Freedom
-from epigauge.bundle.priors import IntrinsicPrior, PointPrior, PositionPrior, Prior
+from epigauge.bundle.priors import Distance, IntrinsicPrior, PointPrior, PositionPrior, Prior
 from epigauge.bundle.ties import Ties
 from epigauge.cameras import CameraModel, Cameras, MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
@@ -153,6 +153,9 @@ def refined_freedom(
     kept = np.zeros(m, np.bool_)
     kept[fixed_points] = True
     kept[[prior.point for prior in priors if isinstance(prior, PointPrior)]] = True
+    for prior in priors:
+        if isinstance(prior, Distance):
+            kept[[prior.point1, prior.point2]] = True
     return Freedom(ties, kept if kept.any() else None)
 
 
@@ -181,6 +184,8 @@ def _check_priors(
             raise ArgumentError(what, f"is on view {prior.view}, which is fixed", remedy)
         if isinstance(prior, PointPrior) and prior.point in fixed_points:
             raise ArgumentError(what, f"is on point {prior.point}, which is fixed", remedy)
+        if isinstance(prior, Distance) and {prior.point1, prior.point2} <= set(fixed_points):
+            raise ArgumentError(what, "is between points that are both fixed", remedy)
         if isinstance(prior, IntrinsicPrior) and not free[names.index(prior.name)]:
             raise ArgumentError(
                 what, f"is on {prior.name}, which refine={tuple(unknown)} fixes", remedy

@@ -51,6 +51,7 @@ def bundle_problem(
     *,
     embedded: bool = False,
     workers: int = 1,
+    stretch: Array | None = None,
     **parts: Any,
 ) -> BundleProblem:
     """Return the problem of cameras of a model.
@@ -71,6 +72,8 @@ def bundle_problem(
         Re-triangulate the points after each step.
     workers : int
         Threads to use where the back end can.
+    stretch : ndarray, shape (2, N), optional
+        Factors of the two coordinates of a residual.
     **parts
         Other parts of a `BundleProblem`: freedom, priors.
     """
@@ -79,7 +82,9 @@ def bundle_problem(
     ties = parts["freedom"].ties if "freedom" in parts else None
     return BundleProblem(
         model,
-        linearizer_for(model, kernels, graph, q, weights, loss or Loss(), workers, ties),
+        linearizer_for(
+            model, kernels, graph, q, weights, loss or Loss(), workers, ties, stretch
+        ),
         lambda cameras, own: np.ascontiguousarray(retract(cameras.T, own.T).T),
         refinement=how if embedded else None,
         floor=0.5 * float(np.sum(weights * (_ROUNDING * q) ** 2)),
@@ -194,6 +199,7 @@ def minimized(
                 strategy, explicit, job.model, kernels, cameras, chosen, job.freedom
             ),
             priors=priors,
+            stretch=job.stretch,
         )
         # Points jump alike whatever the basis, but only in the one chosen here: in no gauge.
         jumps = homogeneous and problem.refinement is not None and gauge is None

@@ -49,6 +49,12 @@ class Border(NamedTuple):
     cameras: Array
     points: Array
 
+    def beside(self, other: Border | None) -> Border:
+        """Return the border of both terms."""
+        if other is None:
+            return self
+        return Border(*(np.concatenate(pair, axis=2) for pair in zip(self, other, strict=True)))
+
 
 @dataclass(frozen=True)
 class Step:

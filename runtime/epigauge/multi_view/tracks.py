@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epigauge._arguments import MAX_PX, MIN_PX, as_array, as_choice, as_double, as_weights
+from epigauge._arguments import MAX_PX, MIN_PX, as_array, as_choice, as_double, as_real, as_weights
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.labels import image_sizes, point_colours, view_names
 
@@ -38,6 +38,9 @@ class Tracks:
         Numbers of views and points; by default the largest index plus one.
     weights : array_like, shape (N,), optional
         Factor of each squared residual.
+    sigma : float or array_like, shape (N,) or (N, 2), optional
+        Standard deviation of each measurement, or of its two coordinates, in the unit of `xy`.
+        Weights are multiplied by (unit / sigma)^2, and priors count by their own `sigma` beside.
     names : sequence of str, optional
         Names of the views, as those of their files; all different.
     sizes : array_like of int, shape (n_views, 2), optional
@@ -54,7 +57,12 @@ class Tracks:
     Attributes
     ----------
     view, point, xy, weights : ndarray
-        The same, sorted by point, then view; read-only.
+        The same, sorted by point, then view; read-only. The weights include `sigma`.
+    unit : float
+        Standard deviation of a coordinate of weight one: the median of `sigma`; 1 without.
+    stretch : ndarray, shape (2, N), or None
+        Factors of the two coordinates of a residual beside its weight, of product one; None where
+        both are measured alike.
     names, sizes, colours, source
         As given, or None.
     order : ndarray of int, shape (N,)
@@ -80,6 +88,7 @@ class Tracks:
         n_points: int | None = None,
         weights: ArrayLike | None = None,
         *,
+        sigma: ArrayLike | None = None,
         names: Sequence[str] | None = None,
         sizes: ArrayLike | None = None,
         colours: ArrayLike | None = None,
@@ -111,7 +120,9 @@ class Tracks:
         self.point: Indices = points[self.order]
         self.xy: Array = np.ascontiguousarray(pixels[self.order])
         w = np.ones(len(views)) if weights is None else as_weights(weights, len(views))
-        self.weights: Array = w[self.order]
+        self.unit, factors, stretch = _measured(sigma, len(views))
+        self.weights: Array = (w * factors)[self.order]
+        self.stretch: Array | None = None if stretch is None else stretch[:, self.order]
         self.source = source
         self.n_repeated = int(self._again().sum())
         self._check(repeated, min_points)
@@ -223,6 +234,9 @@ class Tracks:
         """
         if not self.n_repeated:
             return self, 0.0
+        if self.stretch is not None:
+            was = "differs between x and y where a point is seen several times in one view"
+            raise ArgumentError("sigma", was, "one number an observation")
         first = np.flatnonzero(~self._again())
         count = np.diff([*first, len(self)])
         weights = np.add.reduceat(self.weights, first)
@@ -244,6 +258,7 @@ class Tracks:
             colours=self.colours,
             min_points=1,
         )
+        tracks.unit = self.unit
         return tracks, constant
 
     def _again(self) -> NDArray[np.bool_]:
@@ -410,6 +425,23 @@ def _indices(name: str, value: ArrayLike) -> Indices:
     if len(bad):
         raise ArgumentError(name, f"is {indices[bad[0]]} in row {bad[0]}", "indices from 0")
     return indices.astype(np.intp)
+
+
+def _measured(sigma: ArrayLike | None, count: int) -> tuple[float, Array, Array | None]:
+    """Return the unit of weight, the factors of weights (N,), and of coordinates (2, N) or None."""
+    if sigma is None:
+        return 1.0, np.ones(count), None
+    array = as_real("sigma", sigma, "a number, (N,) or (N, 2)")
+    if array.shape not in ((), (count,), (count, 2)):
+        raise ArgumentError("sigma", f"has shape {array.shape}", f"({count},) or ({count}, 2)")
+    both = np.broadcast_to(array if array.ndim == 2 else array.reshape(-1, 1), (count, 2))
+    bad = np.flatnonzero(~((both > 0.0) & np.isfinite(both)).all(axis=1))
+    if len(bad):
+        raise ArgumentError("sigma", f"is {both[bad[0]]} in row {bad[0]}", "positive numbers")
+    unit = float(np.median(both))
+    mean = np.sqrt(both[:, 0] * both[:, 1])
+    alike = bool((both[:, 0] == both[:, 1]).all())
+    return unit, (unit / mean) ** 2, None if alike else np.ascontiguousarray((mean / both.T))
 
 
 def _extent(name: str, indices: Indices, given: int | None) -> int:

@@ -1,0 +1,1 @@
+"""Covariances of calibrated reconstructions, in any datum."""

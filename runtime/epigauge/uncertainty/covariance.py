@@ -1,0 +1,354 @@
+"""Covariances of calibrated cameras, their intrinsics and points, to first order in the noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge import kernels
+from epigauge._arguments import as_positive
+from epigauge.bundle.jobs import metric_job
+from epigauge.bundle.moves import best_conditioned
+from epigauge.bundle.numpy_linearizer import NumpyLinearizer
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.priors import Prior
+from epigauge.bundle.problem import Estimate
+from epigauge.bundle.run import bundle_problem
+from epigauge.bundle.similarity import Similarity
+from epigauge.cameras import MetricReconstruction, camera_model
+from epigauge.errors import ArgumentError
+from epigauge.multi_view.tracks import Tracks
+from epigauge.two_view.losses import Loss
+from epigauge.uncertainty.datum import Projection, projection
+from epigauge.uncertainty.inverse import Inverse
+
+__all__ = ["MetricCovariance", "Std", "metric_covariance"]
+
+Array = NDArray[np.float64]
+
+#: Numbers of a camera's own tangent before its intrinsics: turn and move.
+_POSE = 6
+
+_KINDS = ("camera", "intrinsics", "point")
+
+
+@dataclass(frozen=True)
+class Std:
+    """Standard deviations.
+
+    Attributes
+    ----------
+    rotations, centres : ndarray, shape (n, 3)
+        Of the small rotation of each view about the axes of the scene, in radians, and of its
+        centre, in the unit of the scene.
+    intrinsics : ndarray, shape (c, k)
+        Of the parameters of each camera, in their units; zero where they are not refined.
+    points : ndarray, shape (m, 3)
+        Of the points.
+    """
+
+    rotations: Array
+    centres: Array
+    intrinsics: Array
+    points: Array
+
+
+@dataclass(frozen=True, eq=False)
+class MetricCovariance:
+    """Covariances of a calibrated reconstruction in a datum.
+
+    A view has six numbers: its small rotation about the axes of the scene (radians), and its
+    centre. `camera`, `intrinsics`, `point` and `between` give any block; each is computed when it
+    is asked for, and no matrix of all unknowns is formed.
+
+    Attributes
+    ----------
+    reconstruction : MetricReconstruction
+        The estimate.
+    noise_px : float
+        Standard deviation of an image coordinate of weight one (in the unit of the tracks): given,
+        or estimated as sqrt(sum of weighted squares / redundancy), priors included.
+    redundancy : int
+        Observations and priors beyond what the unknowns need.
+    gauge : object
+        The datum.
+    open : int
+        How many of the seven motions of the gauge the datum has to hold; priors and fixed views or
+        points hold the rest.
+    """
+
+    reconstruction: MetricReconstruction
+    noise_px: float
+    redundancy: int
+    gauge: Any
+    open: int
+    _inverse: Inverse
+    _projection: Projection
+    _home: Similarity
+    _rows: tuple[Array, Array]
+    _unit: float
+
+    def in_gauge(self, gauge: Any) -> MetricCovariance:
+        """Return the covariance in another datum, from the same inverse.
+
+        Parameters
+        ----------
+        gauge : "inner" or an object of eg.gauge
+            As in `covariance`.
+
+        Returns
+        -------
+        MetricCovariance
+            In the datum; the reconstruction is the same.
+        """
+        there = projection(gauge, *self._rows, self._inverse)
+        return replace(self, gauge=gauge, _projection=there)
+
+    def camera(self, i: int) -> Array:
+        """Return the covariance of rotation and centre of view i, shape (6, 6)."""
+        return self.between(("camera", i), ("camera", i))
+
+    def intrinsics(self, c: int) -> Array:
+        """Return the covariance of the adjustable parameters of camera c, shape (k, k)."""
+        return self.between(("intrinsics", c), ("intrinsics", c))
+
+    def point(self, j: int) -> Array:
+        """Return the covariance of point j, shape (3, 3)."""
+        return self.between(("point", j), ("point", j))
+
+    def between(self, a: tuple[str, int], b: tuple[str, int]) -> Array:
+        """Return the covariance of any two parts.
+
+        Parameters
+        ----------
+        a, b : tuple of str and int
+            Such as ``("camera", 3)``, ``("intrinsics", 0)``, ``("point", 17)``.
+
+        Returns
+        -------
+        ndarray
+            Six numbers a camera, three a point, one an adjustable parameter of intrinsics.
+
+        Raises
+        ------
+        ArgumentError
+            On parts that do not exist.
+        """
+        first, second = self._part("a", a), self._part("b", b)
+        if first.view is None and second.view is None:
+            block = self._inverse.pair(first.index, second.index)
+        elif first.view is None:
+            block = self._inverse.between(self._of(second), first.index).T
+        elif second.view is None:
+            block = self._inverse.between(self._of(first), second.index)
+        else:
+            block = self._inverse.cameras[first.view, :, second.view]
+        block = block + self._low(first) @ self._middle @ self._low(second).T
+        return np.asarray(self._variance * first.out @ block @ second.out.T)
+
+    def distance(self, i: int, j: int) -> tuple[float, float]:
+        """Return the distance of two points and its standard deviation, the same in every datum.
+
+        Parameters
+        ----------
+        i, j : int
+            Points.
+
+        Returns
+        -------
+        tuple of float
+            Length and standard deviation, in the unit of the scene. Where nothing holds the scale,
+            the standard deviation is that in the datum.
+        """
+        X = self.reconstruction.X
+        apart = X[i] - X[j]
+        length = float(np.linalg.norm(apart))
+        along = apart / length
+        cross = self.between(("point", i), ("point", j))
+        both = self.point(i) + self.point(j) - cross - cross.T
+        return length, float(np.sqrt(along @ both @ along))
+
+    @cached_property
+    def std(self) -> Std:
+        """Return the standard deviations of everything."""
+        n, d = self._inverse.cameras.shape[:2]
+        low, middle = self._columns, self._middle
+        blocks = self._inverse.cameras[np.arange(n), :, np.arange(n)]
+        blocks = blocks + np.einsum("ndq,qr,ner->nde", low[0], middle, low[0], optimize=True)
+        poses = self._variance * self._poses @ blocks[:, :_POSE, :_POSE] @ np.swapaxes(
+            self._poses, 1, 2
+        )
+        points = self._inverse.points
+        points = points + np.einsum("mdq,qr,mer->mde", low[1], middle, low[1], optimize=True)
+        turned = self._space @ points @ self._space.T
+        cameras = self.reconstruction.cameras
+        first = np.unique(cameras.camera_of_view, return_index=True)[1]
+        own = np.einsum("nii->ni", blocks)[first, _POSE:d] * self._variance
+        of_poses = np.sqrt(np.maximum(np.einsum("nii->ni", poses), 0.0))
+        return Std(
+            of_poses[:, :3],
+            of_poses[:, 3:],
+            np.sqrt(np.maximum(own, 0.0)),
+            np.sqrt(np.maximum(self._variance * np.einsum("mii->mi", turned), 0.0)),
+        )
+
+    @property
+    def _variance(self) -> float:
+        return (self.noise_px / self._unit) ** 2
+
+    @cached_property
+    def _columns(self) -> tuple[Array, Array]:
+        """L of what is added to X_0: known distances, and the datum."""
+        return (
+            np.concatenate([self._inverse.L_cameras, self._projection.cameras], axis=2),
+            np.concatenate([self._inverse.L_points, self._projection.points], axis=2),
+        )
+
+    @cached_property
+    def _middle(self) -> Array:
+        first, second = self._inverse.M, self._projection.M
+        whole = np.zeros((len(first) + len(second),) * 2)
+        whole[: len(first), : len(first)] = first
+        whole[len(first) :, len(first) :] = second
+        return whole
+
+    @cached_property
+    def _poses(self) -> Array:
+        """From own tangents (turn, move) to small rotation and centre in the scene, (n, 6, 6)."""
+        R = np.swapaxes(self.reconstruction.R, 1, 2)
+        found = np.zeros((len(R), _POSE, _POSE))
+        # x_cam = exp(w) (R X + t - move): the view turns by -R^T w, its centre moves by R^T move.
+        found[:, :3, :3] = -R
+        found[:, 3:, 3:] = R / self._home.scale
+        return found
+
+    @cached_property
+    def _space(self) -> Array:
+        """From points as computed with to points of the scene, (3, 3)."""
+        return np.asarray(self._home.rotation.T / self._home.scale)
+
+    def _low(self, part: _Part) -> Array:
+        return np.asarray(
+            self._columns[1][part.index] if part.view is None else self._columns[0][part.view]
+        )
+
+    def _of(self, part: _Part) -> int:
+        assert part.view is not None
+        return part.view
+
+    def _part(self, name: str, value: Any) -> _Part:
+        cameras = self.reconstruction.cameras
+        counts = {
+            "camera": self.reconstruction.n_views,
+            "intrinsics": len(cameras),
+            "point": self.reconstruction.n_points,
+        }
+        try:
+            kind, index = value
+            count = counts[kind]
+        except (TypeError, ValueError, KeyError):
+            needed = f"a kind ({', '.join(_KINDS)}) and a number, as ('point', 3)"
+            raise ArgumentError(name, f"is {value!r:.60}", needed) from None
+        integer = isinstance(index, int | np.integer) and not isinstance(index, bool)
+        if not integer or not 0 <= index < count:
+            raise ArgumentError(name, f"is {value!r:.60}", f"{kind} 0 to {count - 1}")
+        index = int(index)
+        if kind == "point":
+            return _Part(None, index, self._space)
+        d = self._inverse.cameras.shape[1]
+        if kind == "camera":
+            return _Part(index, index, np.pad(self._poses[index], ((0, 0), (0, d - _POSE))))
+        first = int(np.argmax(cameras.camera_of_view == index))
+        return _Part(first, index, np.eye(d)[_POSE:])
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A view (or the first of a camera) or a point, and what own tangents are multiplied by."""
+
+    view: int | None
+    index: int
+    out: Array
+
+
+def metric_covariance(
+    tracks: Tracks,
+    reconstruction: MetricReconstruction,
+    gauge: Any = "inner",
+    noise_px: float | None = None,
+    *,
+    refine: str | Sequence[str] = "all",
+    fixed_views: Iterable[int] = (),
+    fixed_points: Iterable[int] = (),
+    priors: Iterable[Prior] | None = None,
+    backend: str | None = None,
+) -> MetricCovariance:
+    """Return the covariance of an adjusted calibrated reconstruction; see `eg.covariance`."""
+    tracks = tracks.merged()[0]
+    job = metric_job(
+        tracks,
+        reconstruction,
+        refine=refine,
+        fixed_views=tuple(fixed_views),
+        fixed_points=tuple(fixed_points),
+        priors=priors,
+    )
+    table = kernels.table(backend)
+    graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
+    home = best_conditioned(job.model, job.cameras, job.points)
+    assert isinstance(home, Similarity)
+    cameras, points = home.apply(job.cameras, job.points)
+    priors_there = None if job.priors is None else job.priors.moved(home)
+    weights = np.asarray(tracks.weights)
+    problem = bundle_problem(
+        job.model,
+        table,
+        graph,
+        job.q,
+        weights,
+        Loss(),
+        freedom=job.freedom,
+        priors=priors_there,
+        stretch=job.stretch,
+    )
+    state = problem.evaluate(Estimate(cameras, points))
+    system = problem.linearize(state)
+    reference = NumpyLinearizer(job.model, table, graph, job.q, weights, Loss(), job.stretch)
+    inverse = Inverse.of(system, reference, priors_there, table)
+    redundancy = _redundancy(tracks, job, inverse)
+    if noise_px is not None:
+        noise_px = as_positive("noise_px", noise_px)
+    elif redundancy <= 0:
+        raise ArgumentError("noise_px", "is not given", "a number: nothing is redundant")
+    else:
+        noise_px = float(np.sqrt(2.0 * state.cost / redundancy))
+    return MetricCovariance(
+        reconstruction,
+        noise_px,
+        redundancy,
+        gauge,
+        inverse.motions.open.shape[1],
+        inverse,
+        projection(gauge, cameras, points, inverse),
+        home,
+        (cameras, points),
+        1.0,
+    )
+
+
+def _redundancy(tracks: Tracks, job: Any, inverse: Inverse) -> int:
+    """Return how many observations and priors there are beyond what the unknowns need."""
+    ties = job.freedom.ties
+    n, m = tracks.n_views, tracks.n_points
+    d = camera_model(job.model.name).tangent_size
+    of_views = n * d if ties.A is None else int(np.count_nonzero(ties.A.any(axis=1)))
+    of_points = 3 * m if ties.C is None else int(np.count_nonzero(ties.C.any(axis=1)))
+    observed = 2 * int(np.count_nonzero(tracks.weights > 0.0))
+    known = 0 if job.priors is None else job.priors.n_numbers
+    unknowns = of_views + ties.n_shared + of_points - inverse.motions.open.shape[1]
+    return observed + known - unknowns
