@@ -48,6 +48,7 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge.two_view.refine import refine_fundamental
     from epigauge.two_view.result import FundamentalResult
     from epigauge.two_view.robust import RobustResult, estimate_fundamental
+    from epigauge.uncertainty.covariance import MetricCovariance
 
 __version__ = "0.1.0"
 
@@ -67,6 +68,7 @@ __all__ = [
     "ImageMatches",
     "IntrinsicPrior",
     "Matches",
+    "MetricCovariance",
     "MetricReconstruction",
     "MultiViewScene",
     "PointPrior",
@@ -139,6 +141,7 @@ _WHERE = {
     "two_view.refine": "refine_fundamental",
     "two_view.result": "FundamentalResult",
     "two_view.robust": "RobustResult estimate_fundamental",
+    "uncertainty.covariance": "MetricCovariance",
 }
 _MODULES = {
     **{name: name for name in ("casadi", "colmap", "datasets", "interop", "kernels")},

@@ -194,25 +194,23 @@ class Priors:
                 first = int(np.argmax(start.cameras.camera_of_view == camera))
                 intrinsics.append((first, names.index(prior.name), value, sigma**-2))
             elif isinstance(prior, Distance):
-                ends = [
-                    _index(f"{what}.point{k}", point, start.n_points)
-                    for k, point in ((1, prior.point1), (2, prior.point2))
-                ]
-                if np.array_equal(start.X[ends[0]], start.X[ends[1]]):
+                first = _index(f"{what}.point1", prior.point1, start.n_points)
+                second = _index(f"{what}.point2", prior.point2, start.n_points)
+                if np.array_equal(start.X[first], start.X[second]):
                     raise ArgumentError(what, "is between points at one place", "points apart")
                 length = _positive(f"{what}.length", prior.length)
                 sigma = _positive(f"{what}.sigma", prior.sigma)
-                distances.append((ends[0], ends[1], length, sigma**-2))
+                distances.append((first, second, length, sigma**-2))
             else:
                 kinds = "eg.PositionPrior, eg.IntrinsicPrior, eg.PointPrior or eg.Distance"
                 raise ArgumentError(what, f"is a {type(prior).__name__}", kinds)
         j = np.array([row[:2] for row in intrinsics], np.intp).reshape(-1, 2)
         v = np.array([row[2:] for row in intrinsics]).reshape(-1, 2)
-        stacked = _stacked(places[PositionPrior]), _stacked(places[PointPrior])
+        views, points = _stacked(places[PositionPrior]), _stacked(places[PointPrior])
         ends = np.array([row[:2] for row in distances], np.intp).reshape(-1, 2)
         of_ends = np.array([row[2:] for row in distances]).reshape(-1, 2)
-        parts = j[:, 0], j[:, 1], v[:, 0], v[:, 1], ends, of_ends[:, 0], of_ends[:, 1]
-        return Priors(*stacked[0], *stacked[1], *parts)
+        at, known = (j[:, 0], j[:, 1]), (v[:, 0], v[:, 1])
+        return Priors(*views, *points, *at, *known, ends, of_ends[:, 0], of_ends[:, 1])
 
     def __len__(self) -> int:
         """Return how many there are."""
@@ -287,9 +285,7 @@ class Priors:
         columns[self.ends[:, 1], :, np.arange(count)] = -along
         return Border(np.zeros((n, d, count)), columns)
 
-    def slopes(
-        self, cameras: Array, points: Array, of_cameras: Array, of_points: Array
-    ) -> Array:
+    def slopes(self, cameras: Array, points: Array, of_cameras: Array, of_points: Array) -> Array:
         """Return how what is known changes with motions, unweighted.
 
         Parameters

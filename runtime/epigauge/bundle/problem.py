@@ -137,7 +137,8 @@ class BundleProblem:
         if self.priors is not None:
             normal = self.priors.added(normal, cameras, points)
         normal, border = self.freedom.constrained(normal, cameras, points)
-        known = None if self.priors is None else self.priors.border(*normal.g_cameras.shape, points)
+        n, d = normal.g_cameras.shape
+        known = None if self.priors is None else self.priors.border(n, d, points)
         border = known if border is None else border.beside(known)
         ties = self.freedom.ties_at(cameras, points)
         return BundleSystem(

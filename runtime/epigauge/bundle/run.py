@@ -82,9 +82,7 @@ def bundle_problem(
     ties = parts["freedom"].ties if "freedom" in parts else None
     return BundleProblem(
         model,
-        linearizer_for(
-            model, kernels, graph, q, weights, loss or Loss(), workers, ties, stretch
-        ),
+        linearizer_for(model, kernels, graph, q, weights, loss or Loss(), workers, ties, stretch),
         lambda cameras, own: np.ascontiguousarray(retract(cameras.T, own.T).T),
         refinement=how if embedded else None,
         floor=0.5 * float(np.sum(weights * (_ROUNDING * q) ** 2)),

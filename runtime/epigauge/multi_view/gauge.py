@@ -33,6 +33,7 @@ __all__ = [
     "five_points",
     "group",
     "identity",
+    "inner",
     "normalized",
     "reference_camera",
     "similarity",
@@ -571,6 +572,29 @@ class normalized:
         centre = points[0] + np.mean(points - points[0], axis=0)
         size = float(np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1))))
         return Similarity(1.0 / size, np.eye(3), centre, np.zeros(3))
+
+
+@dataclass(frozen=True)
+class inner:
+    """Inner constraints: of all equivalent small motions the one of least squares over some parts.
+
+    Their mean, their moment about it and their scale do not change; the trace of their covariance
+    is least.
+
+    Parameters
+    ----------
+    points, views : sequence of int, optional
+        Points and centres of views that take part; by default all points.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.gauge.inner(points=[0, 1, 5])
+    inner(points=[0, 1, 5], views=None)
+    """
+
+    points: Sequence[int] | None = None
+    views: Sequence[int] | None = None
 
 
 #: The gauges of this module.

@@ -441,7 +441,7 @@ def _measured(sigma: ArrayLike | None, count: int) -> tuple[float, Array, Array 
     unit = float(np.median(both))
     mean = np.sqrt(both[:, 0] * both[:, 1])
     alike = bool((both[:, 0] == both[:, 1]).all())
-    return unit, (unit / mean) ** 2, None if alike else np.ascontiguousarray((mean / both.T))
+    return unit, (unit / mean) ** 2, None if alike else np.ascontiguousarray(mean / both.T)
 
 
 def _extent(name: str, indices: Indices, given: int | None) -> int:

@@ -9,8 +9,10 @@ which N is best conditioned; no matrix of all parameters is formed.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,8 +21,9 @@ from epigauge import kernels
 from epigauge._arguments import as_choice, as_positive
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer, inverse_roots
 from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.priors import Prior
 from epigauge.bundle.solve import System
-from epigauge.cameras import camera_model
+from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.lengths import linear_length
 from epigauge.multi_view.datum import Projector, freedom, halves, mapped, projector
@@ -29,6 +32,7 @@ from epigauge.multi_view.gauge import Gauge, identity, normalized, two_cameras
 from epigauge.multi_view.sandwich import RobustFit, Sandwich
 from epigauge.multi_view.tracks import Reconstruction, Tracks
 from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
+from epigauge.uncertainty.covariance import MetricCovariance, metric_covariance
 
 __all__ = ["ReconstructionCovariance", "covariance"]
 
@@ -224,6 +228,7 @@ class ReconstructionCovariance:
         return self.projector._scaled(X).T, K @ X
 
 
+@overload
 def covariance(
     tracks: Tracks,
     reconstruction: Reconstruction,
@@ -233,7 +238,35 @@ def covariance(
     loss: str = "linear",
     loss_scale_px: float | str = "auto",
     backend: str | None = None,
-) -> ReconstructionCovariance:
+) -> ReconstructionCovariance: ...
+
+
+@overload
+def covariance(
+    tracks: Tracks,
+    reconstruction: MetricReconstruction,
+    gauge: Any = None,
+    noise_px: float | None = None,
+    *,
+    refine: str | Sequence[str] = "all",
+    fixed_views: Iterable[int] = (),
+    fixed_points: Iterable[int] = (),
+    priors: Iterable[Prior] | None = None,
+    backend: str | None = None,
+) -> MetricCovariance: ...
+
+
+def covariance(
+    tracks: Tracks,
+    reconstruction: Reconstruction | MetricReconstruction,
+    gauge: Any = None,
+    noise_px: float | None = None,
+    *,
+    loss: str = "linear",
+    loss_scale_px: float | str = "auto",
+    backend: str | None = None,
+    **of_metric: Any,
+) -> ReconstructionCovariance | MetricCovariance:
     """Return the covariance of an adjusted reconstruction, in any gauge.
 
     Parameters
@@ -241,13 +274,17 @@ def covariance(
     tracks : Tracks
         Observations that the reconstruction was adjusted to, with their weights: zero for those
         that were set aside.
-    reconstruction : Reconstruction
+    reconstruction : Reconstruction or MetricReconstruction
         Cameras and points at the minimum.
-    gauge : Gauge, optional
-        The reconstruction is moved there, and its covariance is that of the estimate expressed in
-        that gauge. By default the free gauge of the reconstruction as it is: the pseudo-inverse
-        of the normal matrix, of least trace. What a gauge leaves open (an orthonormal change of
-        basis in the normalised one) is treated like that, too.
+    gauge : Gauge or "inner", optional
+        Of a metric reconstruction, which is not moved, the datum: "inner" (default) for inner
+        constraints over all points, ``eg.gauge.inner(points=..., views=...)`` over some,
+        `two_cameras` (one and the distance of another), `reference_camera`, or `five_points` (of
+        three points seven coordinates). What priors and fixed parts hold needs no datum.
+        A projective reconstruction is moved there, and its covariance is that of the estimate
+        expressed in that gauge. By default the free gauge of the reconstruction as it is: the
+        pseudo-inverse of the normal matrix, of least trace. What a gauge leaves open (an
+        orthonormal change of basis in the normalised one) is treated like that, too.
     noise_px : float, optional
         Standard deviation of an image coordinate of weight one. By default estimated from the
         residuals: sqrt(sum of weighted squares / (2 N - 11 n - 3 m + 15)), with a robust loss over
@@ -260,10 +297,13 @@ def covariance(
         Its scale, as `BundleResult.loss_scale_px`; by default from these residuals.
     backend : {"c", "numpy", "casadi"}, optional
         Where the formulas are computed.
+    **of_metric
+        Of a metric reconstruction `refine`, `fixed_views`, `fixed_points` and `priors`, as they
+        were given to `bundle_adjust`.
 
     Returns
     -------
-    ReconstructionCovariance
+    ReconstructionCovariance or MetricCovariance
         Covariances of cameras, points and projected points, and the way to other gauges.
 
     Raises
@@ -282,6 +322,17 @@ def covariance(
     .. [1] K. Kanatani, D. D. Morris, "Gauges and gauge transformations for uncertainty description
        of geometric structure with indeterminacy", IEEE Trans. Inf. Theory 47(5), 2001.
     """
+    if isinstance(reconstruction, MetricReconstruction):
+        if loss != "linear":
+            needed = "'linear'; give observations that were set aside weight zero"
+            raise ArgumentError("loss", f"is {loss!r:.60} for a metric reconstruction", needed)
+        datum = "inner" if gauge is None else gauge
+        options: Any = {**of_metric, "backend": backend}
+        return metric_covariance(tracks, reconstruction, datum, noise_px, **options)
+    if of_metric:
+        raise ArgumentError(
+            next(iter(of_metric)), "is given with a projective reconstruction", "a metric one"
+        )
     P, Q = reconstruction.P, reconstruction.Q
     n, m = len(P), len(Q)
     if (n, m) != (tracks.n_views, tracks.n_points):

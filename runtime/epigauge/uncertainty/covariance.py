@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from epigauge import kernels
 from epigauge._arguments import as_positive
-from epigauge.bundle.jobs import metric_job
+from epigauge.bundle.jobs import Job, metric_job
 from epigauge.bundle.moves import best_conditioned
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.bundle.observations import ObservationGraph
@@ -49,7 +49,7 @@ class Std:
     intrinsics : ndarray, shape (c, k)
         Of the parameters of each camera, in their units; zero where they are not refined.
     points : ndarray, shape (m, 3)
-        Of the points.
+        Of the points; infinite for one whose observations leave it open along its ray.
     """
 
     rotations: Array
@@ -180,21 +180,26 @@ class MetricCovariance:
         low, middle = self._columns, self._middle
         blocks = self._inverse.cameras[np.arange(n), :, np.arange(n)]
         blocks = blocks + np.einsum("ndq,qr,ner->nde", low[0], middle, low[0], optimize=True)
-        poses = self._variance * self._poses @ blocks[:, :_POSE, :_POSE] @ np.swapaxes(
-            self._poses, 1, 2
+        poses = (
+            self._variance
+            * self._poses
+            @ blocks[:, :_POSE, :_POSE]
+            @ np.swapaxes(self._poses, 1, 2)
         )
         points = self._inverse.points
         points = points + np.einsum("mdq,qr,mer->mde", low[1], middle, low[1], optimize=True)
         turned = self._space @ points @ self._space.T
         cameras = self.reconstruction.cameras
         first = np.unique(cameras.camera_of_view, return_index=True)[1]
+        of_points = np.sqrt(np.maximum(self._variance * np.einsum("mii->mi", turned), 0.0))
+        of_points[self._inverse.at_infinity] = np.inf
         own = np.einsum("nii->ni", blocks)[first, _POSE:d] * self._variance
         of_poses = np.sqrt(np.maximum(np.einsum("nii->ni", poses), 0.0))
         return Std(
             of_poses[:, :3],
             of_poses[:, 3:],
             np.sqrt(np.maximum(own, 0.0)),
-            np.sqrt(np.maximum(self._variance * np.einsum("mii->mi", turned), 0.0)),
+            of_points,
         )
 
     @property
@@ -341,7 +346,7 @@ def metric_covariance(
     )
 
 
-def _redundancy(tracks: Tracks, job: Any, inverse: Inverse) -> int:
+def _redundancy(tracks: Tracks, job: Job, inverse: Inverse) -> int:
     """Return how many observations and priors there are beyond what the unknowns need."""
     ties = job.freedom.ties
     n, m = tracks.n_views, tracks.n_points
@@ -349,6 +354,6 @@ def _redundancy(tracks: Tracks, job: Any, inverse: Inverse) -> int:
     of_views = n * d if ties.A is None else int(np.count_nonzero(ties.A.any(axis=1)))
     of_points = 3 * m if ties.C is None else int(np.count_nonzero(ties.C.any(axis=1)))
     observed = 2 * int(np.count_nonzero(tracks.weights > 0.0))
-    known = 0 if job.priors is None else job.priors.n_numbers
+    known = 0 if job.priors is None else int(job.priors.n_numbers)
     unknowns = of_views + ties.n_shared + of_points - inverse.motions.open.shape[1]
-    return observed + known - unknowns
+    return int(observed + known - unknowns)

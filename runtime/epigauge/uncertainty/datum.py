@@ -7,7 +7,6 @@ a covariance X in any datum to S X S^T (the S-transformation of geodesy).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,38 +16,16 @@ from numpy.typing import NDArray
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.gauge import (
     five_points,
+    inner,
     normalized,
     reference_camera,
     two_cameras,
 )
 from epigauge.uncertainty.inverse import Inverse
 
-__all__ = ["Datum", "Projection", "inner", "projection"]
+__all__ = ["Datum", "Projection", "projection"]
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class inner:
-    """Inner constraints: of all equivalent small motions the one of least squares over some parts.
-
-    Their mean, their moment about it and their scale do not change; the trace of their covariance
-    is least.
-
-    Parameters
-    ----------
-    points, views : sequence of int, optional
-        Points and centres of views that take part; by default all points.
-
-    Examples
-    --------
-    >>> import epigauge as eg
-    >>> eg.gauge.inner(points=[0, 1, 5])
-    inner(points=[0, 1, 5], views=None)
-    """
-
-    points: Sequence[int] | None = None
-    views: Sequence[int] | None = None
 
 
 Datum = inner | normalized | reference_camera | two_cameras | five_points

@@ -37,6 +37,10 @@ _SINGULAR = 1e-13
 
 _SUMS = ("U", "V", "g_cameras", "g_points")
 
+#: A point whose block has an eigenvalue below this, of the mean one, is undetermined along its ray:
+#: as much is added, which leaves everything else as it is.
+_RAY = 1e-12
+
 #: Points are gone through in chunks of about this many matrix entries, which bounds the memory.
 _CHUNK = 2_000_000
 
@@ -107,7 +111,7 @@ class Motions:
 def _rows(rows: Array, motions: Array) -> Array:
     """Return the rows that are more than rounding beside the motions themselves."""
     largest = float(np.max(np.linalg.norm(motions, axis=2), initial=0.0))
-    return rows[np.linalg.norm(rows, axis=1) > _FREE * largest]
+    return np.asarray(rows[np.linalg.norm(rows, axis=1) > _FREE * largest])
 
 
 def _null(rows: Array) -> Array:
@@ -142,6 +146,8 @@ class Inverse:
         M.
     motions : Motions
         The gauge freedom.
+    at_infinity : ndarray of bool, shape (m,)
+        Points that their observations leave open along a ray.
     """
 
     graph: ObservationGraph
@@ -153,6 +159,7 @@ class Inverse:
     L_points: Array
     M: Array
     motions: Motions
+    at_infinity: NDArray[np.bool_]
 
     @staticmethod
     def of(
@@ -184,7 +191,8 @@ class Inverse:
         edges = graph.simple
         parts = edges, cameras, V_inverse, W, W @ V_inverse[edges.point]
         none = np.zeros((*cameras.shape[:2], 0)), np.zeros((len(V_inverse), 3, 0)), np.zeros((0, 0))
-        plain = Inverse(*parts, *none, motions)
+        open_rays = undetermined(system.V)
+        plain = Inverse(*parts, *none, motions, open_rays)
         if not motions.held.size and system.constraints is None:
             return plain
         # Known distances couple points: their few columns B are added. What priors hold of the
@@ -203,7 +211,7 @@ class Inverse:
         left = np.einsum("ndk,ndl->kl", F[..., first:], weak[0])
         inner = np.block([[np.eye(across.shape[0]) + _along(B, XB), across], [across.T, -left]])
         M = -np.linalg.inv(0.5 * (inner + inner.T))
-        return Inverse(*parts, *L, 0.5 * (M + M.T), motions)
+        return Inverse(*parts, *L, 0.5 * (M + M.T), motions, open_rays)
 
     def apply(self, cameras: Array, points: Array) -> tuple[Array, Array]:
         """Return X times columns (n, d, k) and (m, 3, k)."""
@@ -240,7 +248,7 @@ class Inverse:
 
     def between(self, view: int, point: int) -> Array:
         """Return the block of X_0 of a camera and a point, (d, 3)."""
-        return self.cross(point)[view]
+        return np.asarray(self.cross(point)[view])
 
     def cross(self, point: int) -> Array:
         """Return the blocks of X_0 of all cameras and a point, (n, d, 3)."""
@@ -255,7 +263,7 @@ class Inverse:
         rows = slice(self.graph.first[j], self.graph.first[j + 1])
         crossed = self.cross(i)[self.graph.view[rows]]
         found = -np.einsum("ndi,ndj->ij", crossed, self.Y[rows])
-        return found + (self.V_inverse[i] if i == j else 0.0)
+        return np.asarray(found + (self.V_inverse[i] if i == j else 0.0))
 
 
 def _firm(
@@ -280,7 +288,8 @@ def _cameras(system: BundleSystem, motions: Motions) -> tuple[Array, Array]:
     W = Covariant().blocks(system)
     whitening = np.linalg.inv(np.swapaxes(np.linalg.cholesky(W.cameras), 1, 2))
     ties: Ties = system.ties.then(whitening, None).scaled(1.0 / np.sqrt(W.shared))
-    root, _ = system.inverse_roots(system.V, W.points, 0.0, system.gradients[2])
+    V = system.V + _RAY * undetermined(system.V)[:, None, None] * _sized(system.V)
+    root, _ = system.inverse_roots(V, W.points, 0.0, system.gradients[2])
     T = system.own_roots(root)
     white = BundleSystem(
         system.normal,
@@ -311,6 +320,19 @@ def _cameras(system: BundleSystem, motions: Motions) -> tuple[Array, Array]:
     half = _own(ties, inverse, n, a)
     whole = _own(ties, np.ascontiguousarray(half.T), n, a)
     return (0.5 * (whole + whole.T)).reshape(n, d, n, d), T @ np.swapaxes(T, 1, 2)
+
+
+def _sized(V: Array) -> Array:
+    """Return unit matrices as large as blocks (m, 3, 3)."""
+    trace = np.einsum("mii->m", V) / V.shape[1]
+    return np.asarray(trace[:, None, None] * np.eye(V.shape[1]))
+
+
+def undetermined(V: Array) -> NDArray[np.bool_]:
+    """Return which points their observations leave open along a ray, (m,)."""
+    size = np.einsum("mii->m", V) / V.shape[1]
+    least = np.linalg.eigvalsh(V / np.where(size > 0.0, size, 1.0)[:, None, None])[:, 0]
+    return np.asarray(least < _RAY)
 
 
 def _own(ties: Ties, columns: Array, n: int, a: int) -> Array:

@@ -1,0 +1,432 @@
+"""Covariances of calibrated reconstructions: against dense algebra, in any datum, and a network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import epigauge as eg
+import numpy as np
+import pytest
+from epigauge.cameras import camera_model
+from numpy.typing import NDArray
+
+from tests.metric_scenes import METRIC, metric_scene
+
+Array = NDArray[np.float64]
+
+#: Fourth-order differences: step and weights.
+STEP, WEIGHTS = 1e-3, {-2: 1.0 / 12.0, -1: -2.0 / 3.0, 1: 2.0 / 3.0, 2: -1.0 / 12.0}
+
+
+def turned(w: Array) -> Array:
+    """Return exp([w]_x)."""
+    angle = float(np.linalg.norm(w))
+    if angle == 0.0:
+        return np.eye(3)
+    K = np.cross(w / angle, np.eye(3)).T
+    return np.asarray(np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K)
+
+
+class Dense:
+    """All numbers of a scene as one vector: rotations and centres, intrinsics, points."""
+
+    def __init__(self, scene: eg.MetricReconstruction, names: tuple[str, ...]) -> None:
+        self.scene = scene
+        known = camera_model(scene.cameras.model).params
+        self.columns = [known.index(name) for name in names]
+        self.sizes = 6 * scene.n_views, len(names) * len(scene.cameras), 3 * scene.n_points
+        self.size = sum(self.sizes)
+
+    def moved(self, delta: Array) -> eg.MetricReconstruction:
+        """Return the scene after small rotations of the views about the axes of space and so on."""
+        scene, (a, b, _) = self.scene, self.sizes
+        pose = delta[:a].reshape(-1, 6)
+        R = np.stack([R @ turned(w).T for R, w in zip(scene.R, pose[:, :3], strict=True)])
+        centres = scene.centres + pose[:, 3:]
+        params = scene.cameras.params.copy()
+        params[:, self.columns] += delta[a : a + b].reshape(len(params), -1)
+        cameras = eg.Cameras(scene.cameras.model, params, scene.cameras.camera_of_view)
+        t = -np.einsum("nij,nj->ni", R, centres)
+        return eg.MetricReconstruction(R, t, scene.X + delta[a + b :].reshape(-1, 3), cameras)
+
+    def jacobian(self, function: Any) -> Array:
+        """Return derivatives of a vector of a scene."""
+        columns = []
+        for k in range(self.size):
+            values = [
+                w * function(self.moved(s * STEP * np.eye(self.size)[k]))
+                for s, w in WEIGHTS.items()
+            ]
+            columns.append(np.sum(values, axis=0) / STEP)
+        return np.stack(columns, axis=1)
+
+    def view(self, i: int) -> slice:
+        return slice(6 * i, 6 * i + 6)
+
+    def camera(self, c: int) -> slice:
+        k = len(self.columns)
+        return slice(self.sizes[0] + k * c, self.sizes[0] + k * (c + 1))
+
+    def point(self, j: int) -> slice:
+        first = self.sizes[0] + self.sizes[1] + 3 * j
+        return slice(first, first + 3)
+
+    def similarities(self) -> Array:
+        """Return motions of all: turns, shifts and the scale of space, (size, 7)."""
+        scene, G = self.scene, np.zeros((self.size, 7))
+        for k in range(3):
+            for i, centre in enumerate(scene.centres):
+                G[self.view(i), k] = np.r_[np.eye(3)[k], np.cross(np.eye(3)[k], centre)]
+                G[self.view(i), 3 + k] = np.r_[np.zeros(3), np.eye(3)[k]]
+                G[self.view(i), 6] = np.r_[np.zeros(3), centre]
+            for j, X in enumerate(scene.X):
+                G[self.point(j), k] = np.cross(np.eye(3)[k], X)
+                G[self.point(j), 3 + k] = np.eye(3)[k]
+                G[self.point(j), 6] = X
+        return G
+
+    def covariance(self, N: Array, C: Array) -> Array:
+        """Return the covariance under conditions C^T delta = 0, by the bordered matrix."""
+        scale = 1.0 / np.sqrt(np.diagonal(N))
+        C = scale[:, None] * C / np.linalg.norm(scale[:, None] * C, axis=0)
+        k = C.shape[1]
+        whole = np.block([[scale[:, None] * N * scale, C], [C.T, np.zeros((k, k))]])
+        inverse = np.linalg.inv(whole)[: self.size, : self.size]
+        return np.asarray(scale[:, None] * inverse * scale)
+
+
+def conditions(dense: Dense, name: str) -> tuple[Any, Array]:
+    """Return a datum and its conditions, written out."""
+    G, scene = dense.similarities(), dense.scene
+    C = np.zeros((dense.size, 7))
+    some = [1, 4, 5, 9, 11]
+    if name == "all points":
+        C[dense.point(0).start :] = G[dense.point(0).start :]
+        return "inner", C
+    if name == "some points and views":
+        for j in some:
+            C[dense.point(j)] = G[dense.point(j)]
+        for i in (0, 2):
+            C[dense.view(i)][3:] = G[dense.view(i)][3:]
+        return eg.gauge.inner(points=some, views=[0, 2]), C
+    if name == "two cameras":
+        C[dense.view(1), :6] = np.eye(6)
+        C[dense.view(3), 6] = np.r_[np.zeros(3), scene.centres[3] - scene.centres[1]]
+        return eg.gauge.two_cameras(1, 3), C
+    C[dense.point(2), :3] = np.eye(3)
+    C[dense.point(7), 3:6] = np.eye(3)
+    C[dense.point(8), 6] = np.cross(scene.X[7] - scene.X[2], scene.X[8] - scene.X[2])
+    return eg.gauge.five_points([2, 7, 8]), C
+
+
+DATUMS = ("all points", "some points and views", "two cameras", "three points")
+
+
+def assert_same(cov: eg.MetricCovariance, dense: Dense, expected: Array, rtol: float) -> None:
+    """Assert that blocks and standard deviations are those of a dense matrix."""
+    parts = {
+        ("camera", 0): dense.view(0),
+        ("camera", 3): dense.view(3),
+        ("intrinsics", 0): dense.camera(0),
+        ("point", 2): dense.point(2),
+        ("point", 9): dense.point(9),
+    }
+    std = np.sqrt(np.maximum(np.diagonal(expected), 0.0))
+    size = np.maximum(std, 1e-7 * std.max())
+    names = camera_model(dense.scene.cameras.model).adjusted
+    known = [names.index(camera_model(dense.scene.cameras.model).params[k]) for k in dense.columns]
+    for a, rows in parts.items():
+        for b, columns in parts.items():
+            found = cov.between(a, b)
+            found = found[known] if a[0] == "intrinsics" else found
+            found = found[:, known] if b[0] == "intrinsics" else found
+            unit = np.outer(size[rows], size[columns])
+            assert (np.abs(found - expected[rows, columns]) <= rtol * unit).all(), (a, b)
+    n = dense.scene.n_views
+    poses = std[: 6 * n].reshape(n, 6)
+    np.testing.assert_allclose(cov.std.rotations, poses[:, :3], rtol, rtol * poses[:, :3].max())
+    np.testing.assert_allclose(cov.std.centres, poses[:, 3:], rtol, rtol * poses[:, 3:].max())
+    points = std[dense.point(0).start :].reshape(-1, 3)
+    np.testing.assert_allclose(cov.std.points, points, rtol, rtol * points.max())
+    params = std[dense.camera(0).start : dense.point(0).start].reshape(len(dense.scene.cameras), -1)
+    np.testing.assert_allclose(cov.std.intrinsics[:, known], params, rtol)
+
+
+def refined(model: str) -> tuple[str, ...]:
+    """Return intrinsics that a small scene determines."""
+    known = camera_model(model)
+    return tuple(known.params[k] for k in known.focal)
+
+
+@pytest.mark.parametrize("model", METRIC)
+def test_every_model_agrees_with_dense_algebra(model: str) -> None:
+    names = refined(model)
+    tracks, scene = metric_scene(model, 3, n_points=14)
+    dense = Dense(scene, names)
+    J = dense.jacobian(lambda s: s.project(tracks).ravel())
+    datum, C = conditions(dense, "all points")
+    cov = eg.covariance(tracks, scene, datum, 0.7, refine=names or "pose")
+    assert cov.open == 7
+    assert_same(cov, dense, 0.49 * dense.covariance(J.T @ J, C), 1e-5)
+
+
+@pytest.mark.parametrize("name", DATUMS)
+def test_datums_agree_with_dense_algebra_and_one_another(name: str) -> None:
+    tracks, scene = metric_scene("SIMPLE_RADIAL", 1, n_points=16, n_cameras=4)
+    dense = Dense(scene, ("f", "k"))
+    J = dense.jacobian(lambda s: s.project(tracks).ravel())
+    datum, C = conditions(dense, name)
+    options: dict[str, Any] = {"refine": ("f", "k")}
+    cov = eg.covariance(tracks, scene, datum, 1.0, **options)
+    assert_same(cov, dense, dense.covariance(J.T @ J, C), 1e-6)
+    other = eg.covariance(tracks, scene, "inner", 1.0, **options)
+    for there, direct in ((other.in_gauge(datum), cov), (cov.in_gauge("inner"), other)):
+        for part in (("camera", 2), ("point", 3), ("intrinsics", 1)):
+            expected = direct.between(part, part)
+            np.testing.assert_allclose(
+                there.between(part, part), expected, 1e-10, 1e-10 * np.abs(expected).max()
+            )
+    # What no gauge changes: intrinsics, and ratios of lengths.
+    np.testing.assert_allclose(cov.std.intrinsics, other.std.intrinsics, rtol=1e-9)
+
+
+def test_inner_constraints_have_the_least_trace() -> None:
+    tracks, scene = metric_scene("PINHOLE", 2, n_points=16)
+    cov = eg.covariance(tracks, scene, noise_px=1.0, refine="pose")
+    least = np.sum(cov.std.points**2)
+    for name in DATUMS[1:]:
+        datum = conditions(Dense(scene, ()), name)[0]
+        assert np.sum(cov.in_gauge(datum).std.points ** 2) > 1.01 * least
+
+
+def test_what_is_known_is_the_datum() -> None:
+    """Positions of two metres, three control points, or a bar beside them: as dense algebra."""
+    tracks, scene = metric_scene("OPENCV", 4, n_points=16)
+    names = ("fx", "fy")
+    dense = Dense(scene, names)
+    J = dense.jacobian(lambda s: s.project(tracks).ravel())
+    none = np.zeros((dense.size, 0))
+    gps = [eg.PositionPrior(i, scene.centres[i], sigma=2.0) for i in range(4)]
+    control = [eg.PointPrior(j, scene.X[j], sigma=(0.01, 0.02, 0.05)) for j in (0, 3, 8)]
+    bar = eg.Distance(2, 5, float(np.linalg.norm(scene.X[2] - scene.X[5])), 0.003)
+    focal = eg.IntrinsicPrior(0, "fx", scene.cameras.params[0, 0], 0.5)
+    for priors, open_ in (
+        (gps, 0),
+        (control, 0),
+        ([*gps, *control, bar, focal], 0),
+        ([bar, focal], 6),
+        ([focal], 7),
+        (gps[:1], 4),
+        ([gps[0], bar], 3),
+    ):
+        N = J.T @ J
+        for prior in priors:
+            row = np.zeros((3, dense.size))
+            if isinstance(prior, eg.PositionPrior):
+                row[:, dense.view(prior.view).start + 3 : dense.view(prior.view).stop] = np.eye(3)
+                row /= np.broadcast_to(prior.sigma, 3)[:, None]
+            elif isinstance(prior, eg.PointPrior):
+                row[:, dense.point(prior.point)] = np.eye(3)
+                row /= np.broadcast_to(prior.sigma, 3)[:, None]
+            elif isinstance(prior, eg.Distance):
+                apart = (scene.X[2] - scene.X[5]) / prior.length / prior.sigma
+                row[0, dense.point(2)], row[0, dense.point(5)] = apart, -apart
+            else:
+                row[0, dense.camera(0).start] = 1.0 / prior.sigma
+            N = N + row.T @ row
+        cov = eg.covariance(tracks, scene, None, 1.0, refine=names, priors=priors)
+        assert cov.open == open_
+        C = none
+        if open_:
+            # Inner constraints of the motions that are still free.
+            G = dense.similarities()
+            held = (N - J.T @ J) @ G / np.linalg.norm(G, axis=0)
+            free = np.linalg.svd(held)[2][7 - open_ :].T / np.linalg.norm(G, axis=0)[:, None]
+            C = np.zeros((dense.size, open_))
+            C[dense.point(0).start :] = (G @ free)[dense.point(0).start :]
+        expected = dense.covariance(N, C)
+        assert_same(cov, dense, expected, 2e-6)
+        a, b = dense.point(2), dense.point(5)
+        apart = (scene.X[2] - scene.X[5]) / bar.length
+        spread = expected[a, a] + expected[b, b] - expected[a, b] - expected[b, a]
+        assert cov.distance(2, 5)[1] == pytest.approx(np.sqrt(apart @ spread @ apart), rel=1e-6)
+
+
+def test_fixed_views_and_points_have_no_variance() -> None:
+    tracks, scene = metric_scene("PINHOLE", 5, n_points=16)
+    dense = Dense(scene, ())
+    N = dense.jacobian(lambda s: s.project(tracks).ravel())
+    N = N.T @ N
+    C = np.zeros((dense.size, 9))
+    C[dense.view(1), :6], C[dense.point(4), 6:] = np.eye(6), np.eye(3)
+    cov = eg.covariance(tracks, scene, None, 1.0, refine="pose", fixed_views=[1], fixed_points=[4])
+    assert cov.open == 0
+    assert_same(cov, dense, dense.covariance(N, C), 1e-6)
+    assert not cov.camera(1).any()
+    assert not cov.point(4).any()
+
+
+def test_a_far_frame_of_another_scale_gives_the_same_covariance() -> None:
+    tracks, scene = metric_scene("RADIAL", 6, n_points=20, noise_px=0.3)
+    R = turned(np.array([0.3, -1.2, 0.7]))
+    moved = eg.gauge.transform(scene, eg.gauge.similarity(250.0, R, [1e5, -3e4, 2e4]))
+    here, there = (eg.covariance(tracks, s, noise_px=1.0, refine=("f",)) for s in (scene, moved))
+    np.testing.assert_allclose(
+        there.point(3), 250.0**2 * R @ here.point(3) @ R.T, atol=1e-6 * np.abs(there.point(3)).max()
+    )
+    np.testing.assert_allclose(there.std.intrinsics, here.std.intrinsics, rtol=1e-7)
+    turn = here.camera(2)[:3, :3]
+    np.testing.assert_allclose(there.camera(2)[:3, :3], R @ turn @ R.T, rtol=1e-5, atol=1e-14)
+
+
+@pytest.mark.parametrize("each", ["observation", "coordinate"])
+def test_sigma_weighs_as_whitened_measurements(each: str) -> None:
+    """Adjustment and covariance are those of dense Gauss-Newton with every coordinate's own."""
+    tracks, scene = metric_scene("SIMPLE_PINHOLE", 7, n_points=15, noise_px=0.5)
+    rng = np.random.default_rng(1)
+    shape = (len(tracks), 2) if each == "coordinate" else (len(tracks),)
+    sigma = rng.uniform(0.2, 3.0, shape)
+    measured = eg.Tracks(tracks.view, tracks.point, tracks.xy, sigma=sigma)
+    both = np.broadcast_to(sigma.reshape(len(tracks), -1), (len(tracks), 2))
+    result = eg.bundle_adjust(measured, scene, refine="pose", ftol=1e-15)
+    dense = Dense(result.reconstruction, ())
+    J = dense.jacobian(lambda s: s.project(measured).ravel()) / both.reshape(-1, 1)
+    r = (result.fun / both).ravel()
+    assert np.abs(J.T @ r).max() < 1e-5 * np.abs(J).max()
+    assert result.cost == pytest.approx(0.5 * measured.unit**2 * float(r @ r), rel=1e-9)
+    datum, C = conditions(dense, "all points")
+    cov = eg.covariance(measured, result.reconstruction, datum, measured.unit, refine="pose")
+    assert_same(cov, dense, dense.covariance(J.T @ J, C), 1e-5)
+    # The order of the rows is nobody's business.
+    order = rng.permutation(len(tracks))
+    shuffled = eg.Tracks(
+        tracks.view[order], tracks.point[order], tracks.xy[order], sigma=sigma[order]
+    )
+    np.testing.assert_array_equal(shuffled.weights, measured.weights)
+
+
+def test_noise_is_estimated_with_the_redundancy() -> None:
+    tracks, scene = metric_scene("SIMPLE_RADIAL", 8, n_views=6, n_points=60, noise_px=0.8)
+    result = eg.bundle_adjust(tracks, scene, refine=("f", "k"))
+    cov = eg.covariance(tracks, result.reconstruction, refine=("f", "k"))
+    assert cov.redundancy == 2 * len(tracks) - 6 * 6 - 2 * 2 - 3 * 60 + 7
+    assert cov.noise_px**2 == pytest.approx(np.sum(result.fun**2) / cov.redundancy, rel=1e-9)
+    assert cov.noise_px == pytest.approx(0.8, rel=0.15)
+
+
+def test_errors_of_many_runs_are_as_promised() -> None:
+    """Monte Carlo: chi-square of a distance's ratio, an intrinsic and a point, 60 runs."""
+    _, scene = metric_scene("SIMPLE_RADIAL", 9, n_views=5, n_points=25, visible=1.0)
+    blank = metric_scene("SIMPLE_RADIAL", 9, n_views=5, n_points=25, visible=1.0)[0]
+    clean, squares = scene.project(blank), []
+    for seed in range(60):
+        xy = clean + np.random.default_rng(seed).normal(0.0, 0.5, clean.shape)
+        tracks = eg.Tracks(blank.view, blank.point, xy)
+        found = eg.bundle_adjust(tracks, scene, refine=("f",)).reconstruction
+        cov = eg.covariance(tracks, found, eg.gauge.five_points([0, 1, 2]), 0.5, refine=("f",))
+        datum = eg.gauge.five_points([0, 1, 2])
+        rows = found.cameras.params[:1], None
+        moves = [datum.similarity(np.zeros((0, 12)), s.X) for s in (found, scene)]
+        there = moves[1].inverse().positions(moves[0].positions(found.X))
+        off = there[7] - scene.X[7]
+        squares.append(
+            (
+                off @ np.linalg.solve(cov.point(7), off) / 3.0,
+                ((rows[0][0, 0] - scene.cameras.params[0, 0]) / cov.std.intrinsics[0, 0]) ** 2,
+            )
+        )
+    mean = np.mean(squares, axis=0)
+    # Four standard deviations of such means.
+    assert abs(mean[0] - 1.0) < 4.0 * np.sqrt(2.0 / 180.0)
+    assert abs(mean[1] - 1.0) < 4.0 * np.sqrt(2.0 / 60.0)
+
+
+def test_bad_arguments_are_named() -> None:
+    tracks, scene = metric_scene("PINHOLE", 0, n_points=12)
+    cov = eg.covariance(tracks, scene, noise_px=1.0, refine="pose")
+    for call, name in (
+        (lambda: cov.between(("camera", 9), ("point", 0)), "a"),
+        (lambda: cov.between(("point", 0), ("face", 1)), "b"),
+        (lambda: cov.in_gauge("outer"), "gauge"),
+        (lambda: cov.in_gauge(eg.gauge.inner(points=[99])), "gauge.points"),
+        (lambda: cov.in_gauge(eg.gauge.inner(points=[0, 1])), "gauge"),
+        (lambda: eg.covariance(tracks, scene, noise_px=-1.0), "noise_px"),
+        (lambda: eg.covariance(tracks, scene, loss="huber"), "loss"),
+        (lambda: eg.covariance(tracks, scene.to_projective(), priors=[]), "priors"),
+        (lambda: eg.Tracks(tracks.view, tracks.point, tracks.xy, sigma=0.0), "sigma"),
+        (lambda: eg.Tracks(tracks.view, tracks.point, tracks.xy, sigma=[1.0, 2.0]), "sigma"),
+        (lambda: eg.bundle_adjust(tracks, scene, priors=[eg.Distance(0, 0, 1.0, 1.0)]), "priors"),
+        (lambda: eg.bundle_adjust(tracks, scene, priors=[eg.Distance(0, 1, -1.0, 1.0)]), "priors"),
+    ):
+        with pytest.raises(eg.ArgumentError) as error:
+            call()
+        assert error.value.argument.startswith(name)
+
+
+@pytest.fixture(scope="module")
+def network(data_dir: Path) -> tuple[Any, eg.Tracks, eg.MetricReconstruction, eg.Distance]:
+    """Return the metrology network: its file, observations, start and scale bar."""
+    path = data_dir / "metrology_aicon" / "network.npz"
+    if not path.is_file():
+        pytest.skip(f"no {path.name}")
+    file = dict(np.load(path))
+    turns = [
+        turned(np.array([a, 0, 0])) @ turned(np.array([0, b, 0])) @ turned(np.array([0, 0, c]))
+        for a, b, c in file["start_angles"]
+    ]
+    R = np.swapaxes(np.stack(turns), 1, 2)
+    c, x0, y0, A1, A2, B1, B2 = file["start_camera"]
+    row = [c, x0, y0, A1, A2, file["fixed_A3"], B1, B2, file["fixed_C1"], file["fixed_C2"]]
+    cameras = eg.Cameras("brown", [[*row, file["r0"]]], np.zeros(len(R), int))
+    t = -np.einsum("nij,nj->ni", R, file["start_position"])
+    start = eg.MetricReconstruction(R, t, file["start_points"], cameras)
+    tracks = eg.Tracks(file["view"], file["point"], file["xy"], sigma=file["sigma"], min_points=3)
+    ends = map(int, file["scale_bar_points"])
+    bar = eg.Distance(*ends, float(file["scale_bar_length"]), float(file["scale_bar_sigma"]))
+    return file, tracks, start, bar
+
+
+def test_the_report_of_a_metrology_network_is_reached(network: Any, data_dir: Path) -> None:
+    file, tracks, start, bar = network
+    free = tuple(file["camera_names"].tolist())
+    result = eg.bundle_adjust(tracks, start, refine=free, priors=[bar], ftol=1e-10)
+    assert result.success
+    assert result.nit <= 8
+    assert result.cost / tracks.unit**2 == pytest.approx(6179.7037971, rel=1e-8)
+    # Into the frame of the report, which the free network leaves open.
+    there, found = file["own_points"], result.reconstruction
+    a, b = found.X - found.X.mean(axis=0), there - there.mean(axis=0)
+    U, _, Vt = np.linalg.svd(b.T @ a)
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    shift = there.mean(axis=0) - R @ found.X.mean(axis=0)
+    found = eg.gauge.transform(found, eg.gauge.similarity(1.0, R, shift))
+    np.testing.assert_allclose(found.X, there, atol=1e-6)
+    cov = eg.covariance(tracks, found, refine=free, priors=[bar])
+    assert (cov.redundancy, cov.open) == (18804, 6)
+    assert cov.noise_px == pytest.approx(0.40536263e-3, rel=1e-7)
+    names = camera_model("brown").adjusted
+    own = [names.index(name) for name in free]
+    np.testing.assert_allclose(cov.std.intrinsics[0, own], file["camera_sd"], rtol=1e-5)
+    # As printed, to half a unit of the last digit.
+    np.testing.assert_allclose(cov.std.centres, file["position_sd"], atol=5.1e-5)
+    np.testing.assert_allclose(cov.std.points, file["points_sd"], atol=5.1e-5)
+    np.testing.assert_allclose(2.0 * cov.std.rotations, file["rotation_sd_report"], atol=5.1e-7)
+    np.testing.assert_allclose(
+        cov.intrinsics(0)[np.ix_(own, own)], file["own_camera_cov"], rtol=1e-6
+    )
+    corr = cov.between(("camera", 7), ("intrinsics", 0))[3:, own]
+    corr = corr / np.outer(cov.std.centres[7], cov.std.intrinsics[0, own])
+    np.testing.assert_allclose(corr, file["position_camera_corr"][7], atol=6e-4)
+    length, sigma = cov.distance(50, 55)
+    assert length == pytest.approx(1651.0013, abs=1e-4)
+    assert sigma == pytest.approx(0.01196, rel=5e-4)
+    full = np.load(data_dir / "metrology_aicon" / "points_covariance.npz")["own_points_cov_full"]
+    some = range(0, 150, 11)
+    for i in some:
+        for j in some:
+            np.testing.assert_allclose(
+                cov.between(("point", i), ("point", j)),
+                full[3 * i : 3 * i + 3, 3 * j : 3 * j + 3],
+                atol=1e-8 * np.abs(full).max(),
+            )
