@@ -209,8 +209,8 @@ class Priors:
         views, points = _stacked(places[PositionPrior]), _stacked(places[PointPrior])
         ends = np.array([row[:2] for row in distances], np.intp).reshape(-1, 2)
         of_ends = np.array([row[2:] for row in distances]).reshape(-1, 2)
-        at, known = (j[:, 0], j[:, 1]), (v[:, 0], v[:, 1])
-        return Priors(*views, *points, *at, *known, ends, of_ends[:, 0], of_ends[:, 1])
+        at, numbers = (j[:, 0], j[:, 1]), (v[:, 0], v[:, 1])
+        return Priors(*views, *points, *at, *numbers, ends, of_ends[:, 0], of_ends[:, 1])
 
     def __len__(self) -> int:
         """Return how many there are."""

@@ -17,31 +17,37 @@ import epigauge as eg
 from epigauge._arguments import as_count
 from epigauge.cli._common import DONE, console, shown
 from epigauge.cli.info import processor, version
-from epigauge.reproduce import b2003, bs2004, gauges_metric
+from epigauge.reproduce import b2003, bs2004, gauges_metric, metrology
 from epigauge.reproduce.common import Study
 from epigauge.reproduce.gauge_runs import GaugeStudy
 from epigauge.reproduce.gauges_metric import MetricGaugeStudy
+from epigauge.reproduce.metrology import MetrologyStudy
 
 
 class Paper(StrEnum):
-    """What can be repeated: the papers' experiments, and those of 2003 with calibrated cameras."""
+    """What can be repeated: the papers' experiments, and what was added to them."""
 
     bs2004 = "bs2004"
     b2003 = "b2003"
     gauges_metric = "gauges-metric"
+    metrology = "metrology"
 
 
 def reproduce(
     paper: Annotated[
         Paper,
-        typer.Argument(help="Bartoli & Sturm 2004, Bartoli 2003, or that with calibrated cameras."),
+        typer.Argument(
+            help="Bartoli & Sturm 2004, Bartoli 2003, that with calibrated cameras, or the "
+            "covariances of a metrology network."
+        ),
     ],
     only: Annotated[
         list[str] | None,
         typer.Option(
             help=f"Experiments of bs2004: {', '.join(bs2004.EXPERIMENTS)}; of b2003: "
             f"{', '.join(b2003.EXPERIMENTS)}; of gauges-metric: "
-            f"{', '.join(gauges_metric.EXPERIMENTS)}."
+            f"{', '.join(gauges_metric.EXPERIMENTS)}; of metrology: "
+            f"{', '.join(metrology.EXPERIMENTS)}."
         ),
     ] = None,
     trials: Annotated[int, typer.Option(help="Trials a configuration; the paper has 100.")] = 10,
@@ -66,15 +72,17 @@ def reproduce(
         return track(items, label, console=out, transient=True, disable=not out.is_terminal)
 
     data = Path(os.environ.get("EPIGAUGE_DATA", Path("..", "shared", "data")))
-    study: Study | GaugeStudy | MetricGaugeStudy
+    study: Study | GaugeStudy | MetricGaugeStudy | MetrologyStudy
     measured = data if data.is_dir() else None
     if paper is Paper.bs2004:
         pairs = data / "pairs"
         work, study = bs2004.PAPER, Study(trials, seed, pairs if pairs.is_dir() else None, progress)
     elif paper is Paper.b2003:
         work, study = b2003.PAPER, GaugeStudy(trials, seed, measured, progress)
-    else:
+    elif paper is Paper.gauges_metric:
         work, study = gauges_metric.PAPER, MetricGaugeStudy(trials, seed, measured, progress)
+    else:
+        work, study = metrology.PAPER, MetrologyStudy(trials, seed, measured, progress)
     for path in work.reproduce(output, study, _machine(), names):
         out.print(escape(shown(path)), soft_wrap=True)
     return DONE

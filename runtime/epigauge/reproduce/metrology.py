@@ -1,0 +1,292 @@
+"""Covariances against the report of a metrology network, and against simulated errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.bundle.priors import Distance
+from epigauge.cameras import Cameras, MetricReconstruction, camera_model
+from epigauge.io._rotations import from_rodrigues
+from epigauge.multi_view.adjust import bundle_adjust
+from epigauge.multi_view.gauge import five_points, similarity, transform, two_cameras
+from epigauge.multi_view.tracks import Tracks
+from epigauge.multi_view.uncertainty import covariance
+from epigauge.reproduce.common import Track, tracked
+from epigauge.reproduce.report import Claim, Section, Table
+from epigauge.reproduce.run import Paper
+
+__all__ = ["EXPERIMENTS", "PAPER", "MetrologyStudy", "load_network"]
+
+Array = NDArray[np.float64]
+
+#: Camera models of the simulation, and what of their intrinsics is refined.
+_MODELS = {"pinhole": ("fx", "fy"), "bal": ("f", "k1"), "brown": ("c", "A1")}
+_NOISE = 0.5
+#: 95 % points of chi-square by degrees of freedom.
+_CHI2 = {1: 3.841, 2: 5.991, 3: 7.815}
+
+
+@dataclass
+class MetrologyStudy:
+    """What the experiments are run with.
+
+    Parameters
+    ----------
+    trials : int
+        Simulated runs a model; run k has the seed `seed` + k.
+    seed : int
+        First seed.
+    data : path, optional
+        Directory of measured data, or None where there is none.
+    track : callable
+        Wraps the items of a loop, given its label, to show progress.
+    """
+
+    trials: int = 10
+    seed: int = 0
+    data: Path | None = None
+    track: Track = tracked
+
+
+def load_network(
+    path: Path,
+) -> tuple[dict[str, Any], Tracks, MetricReconstruction, Distance]:
+    """Read the network: the whole file, observations, start and scale bar.
+
+    Parameters
+    ----------
+    path : path
+        `network.npz`, as its README describes it.
+    """
+    with np.load(path) as archive:
+        file = {name: archive[name] for name in archive.files}
+    axes = np.eye(3)
+    turns = [from_rodrigues(file["start_angles"][:, k : k + 1] * axes[k]) for k in range(3)]
+    R = np.swapaxes(turns[0] @ turns[1] @ turns[2], 1, 2)
+    c, x0, y0, A1, A2, B1, B2 = file["start_camera"]
+    fixed = file["fixed_C1"], file["fixed_C2"], file["r0"]
+    row = [c, x0, y0, A1, A2, file["fixed_A3"], B1, B2, *fixed]
+    cameras = Cameras("brown", np.array([row], np.float64), np.zeros(len(R), np.intp))
+    t = -np.einsum("nij,nj->ni", R, file["start_position"])
+    start = MetricReconstruction(R, t, file["start_points"], cameras)
+    tracks = Tracks(file["view"], file["point"], file["xy"], sigma=file["sigma"], min_points=3)
+    first, second = (int(k) for k in file["scale_bar_points"])
+    bar = Distance(first, second, float(file["scale_bar_length"]), float(file["scale_bar_sigma"]))
+    return file, tracks, start, bar
+
+
+def aligned(reconstruction: MetricReconstruction, X: Array) -> MetricReconstruction:
+    """Return a reconstruction turned and shifted, not scaled, so that its points are nearest X."""
+    a, b = reconstruction.X - reconstruction.X.mean(axis=0), X - X.mean(axis=0)
+    U, _, Vt = np.linalg.svd(b.T @ a)
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    shift = X.mean(axis=0) - R @ reconstruction.X.mean(axis=0)
+    return transform(reconstruction, similarity(1.0, R, shift))
+
+
+def network(study: MetrologyStudy) -> Section:
+    """Adjust the network from its start and compare with the commercial report."""
+    title = "A network of 115 views against its commercial report"
+    path = None if study.data is None else study.data / "metrology_aicon" / "network.npz"
+    if path is None or not path.is_file():
+        return Section(title, ["No measured data was found: set EPIGAUGE_DATA."])
+    file, tracks, start, bar = load_network(path)
+    free = tuple(file["camera_names"].tolist())
+    result = bundle_adjust(tracks, start, refine=free, priors=[bar], ftol=1e-10)
+    cov = covariance(
+        tracks, aligned(result.reconstruction, file["own_points"]), refine=free, priors=[bar]
+    )
+    std = cov.std
+    own = [camera_model("brown").adjusted.index(name) for name in free]
+    intrinsics = std.intrinsics[0, own]
+    length, sigma = cov.distance(50, 55)
+    rows: list[tuple[Any, ...]] = [
+        ("sigma of unit weight (mm)", 0.00040536263, cov.noise_px, 1e-7),
+        ("redundancy", 18804, cov.redundancy, 0.0),
+        ("longest distance (mm)", 1651.0013, length, 1e-4 / 1651.0),
+        ("its sigma (mm), gauge free", 0.01196, sigma, 5e-4),
+        *(
+            (f"sigma of {name}", float(a), float(b), 1e-5)
+            for name, a, b in zip(free, file["camera_sd"], intrinsics, strict=True)
+        ),
+    ]
+    for label, report, ours in (
+        ("positions", file["position_sd"], std.centres),
+        ("points", file["points_sd"], std.points),
+        ("rotations, twice", file["rotation_sd_report"], 2.0 * std.rotations),
+    ):
+        rms = (float(np.sqrt(np.mean(a**2))) for a in (report, ours))
+        largest = float(np.abs(report - ours).max())
+        rows.append((f"RMS sigma of {label}", *rms, 1e-3))
+        # Half a unit of the last digit that is printed.
+        printed = 5.1e-7 if label.startswith("rot") else 5.1e-5
+        rows.append((f"largest difference, {label}", 0.0, largest, printed))
+    good = [abs(a - b) <= tol * (abs(a) or 1.0) for _, a, b, tol in rows]
+    cells = [(*row[:3], "yes" if ok else "no") for row, ok in zip(rows, good, strict=True)]
+    return Section(
+        title,
+        [
+            "Start: camera constant 28, no distortion, positions off by 20 mm, angles by 0.02 rad, "
+            "points by 10 mm. One scale bar holds the scale; rotation and place are left to inner "
+            f"constraints over all 150 points. {result.nit} steps. The report prints four decimals "
+            "of positions and points.",
+            Table(
+                "network",
+                "Report and ours; within: to the digits that the report has.",
+                ("quantity", "report", "ours", "within"),
+                cells,
+                ("", ".8g"),
+            ),
+        ],
+        [
+            Claim(
+                "report",
+                "all standard deviations of the network are reached",
+                all(good),
+                f"{sum(good)} of {len(good)} lines of the table",
+            )
+        ],
+    )
+
+
+def simulated(model: str, seed: int) -> tuple[Tracks, MetricReconstruction]:
+    """Return five views of thirty points with noise, and the truth; the same but for the noise."""
+    random = np.random.default_rng(list(_MODELS).index(model))
+    along = -1.0 if model in ("bal", "brown") else 1.0
+    X = random.uniform(-1.0, 1.0, (30, 3))
+    R, t = np.empty((5, 3, 3)), np.empty((5, 3))
+    for i, angle in enumerate(np.linspace(0.0, 1.8, 5)):
+        z = -np.array([np.cos(angle), 0.3 * np.sin(3.0 * angle), np.sin(angle)])
+        z *= along / np.linalg.norm(z)
+        x = np.cross([0.1 * i, 1.0, 0.0], z)
+        x /= np.linalg.norm(x)
+        R[i] = [x, np.cross(z, x), z]
+        t[i] = 5.0 * along * np.array([0.0, 0.0, 1.0])
+    known = camera_model(model)
+    values = {"f": 800.0, "fx": 800.0, "fy": 820.0, "c": 800.0, "k1": -0.1, "A1": -2e-7}
+    row = [values.get(name, 0.0) for name in known.params]
+    cameras = Cameras(model, np.array([row]), np.zeros(5, np.intp))
+    truth = MetricReconstruction(R, t, X, cameras)
+    view, point = np.divmod(np.arange(150), 30)
+    blank = Tracks(view, point, np.zeros((150, 2)))
+    noise = np.random.default_rng([seed, 1]).normal(0.0, _NOISE, (150, 2))
+    return Tracks(blank.view, blank.point, truth.project(blank) + noise), truth
+
+
+def _moved_to(
+    datum: Any, found: MetricReconstruction, truth: MetricReconstruction
+) -> MetricReconstruction:
+    """Return an estimate moved so that it agrees with the truth in what the datum holds."""
+    if datum == "inner":
+        a, b = found.X - found.X.mean(axis=0), truth.X - truth.X.mean(axis=0)
+        U, values, Vt = np.linalg.svd(b.T @ a)
+        R, s = U @ Vt, float(values.sum() / np.sum(a**2))
+        shift = truth.X.mean(axis=0) - s * R @ found.X.mean(axis=0)
+        return transform(found, similarity(s, R, shift))
+    here, there = (datum.similarity(r.vectors, r.X) for r in (found, truth))
+    back = there.inverse()
+    s, R = here.scale * back.scale, back.rotation @ here.rotation
+    return transform(found, similarity(s, R, back.positions(here.positions(np.zeros((1, 3))))[0]))
+
+
+def coverage(study: MetrologyStudy) -> Section:
+    """Count how often the truth lies in the regions of 95 %, and compare standard deviations."""
+    datums: dict[str, Any] = {
+        "inner": "inner",
+        "two cameras": two_cameras(0, 4),
+        "three points": five_points([0, 1, 2]),
+    }
+    rows = []
+    for model, free in study.track(list(_MODELS.items()), "simulated runs"):
+        inside: dict[tuple[str, str], list[bool]] = {}
+        errors: dict[tuple[str, str], list[Array]] = {}
+        promised: dict[tuple[str, str], list[Array]] = {}
+        for trial in range(study.trials):
+            tracks, truth = simulated(model, study.seed + trial)
+            found = bundle_adjust(tracks, truth, refine=free).reconstruction
+            for name, datum in datums.items():
+                moved = _moved_to(datum, found, truth)
+                there = covariance(tracks, moved, datum, _NOISE, refine=free)
+                own = [camera_model(model).adjusted.index(p) for p in free]
+                places = [camera_model(model).params.index(p) for p in free]
+                for part, error, block in (
+                    ("point", moved.X[9] - truth.X[9], there.point(9)),
+                    ("centre", moved.centres[2] - truth.centres[2], there.camera(2)[3:, 3:]),
+                    (
+                        "intrinsics",
+                        (moved.cameras.params - truth.cameras.params)[0, places],
+                        there.intrinsics(0)[np.ix_(own, own)],
+                    ),
+                ):
+                    key = name, part
+                    square = float(error @ np.linalg.solve(block, error))
+                    inside.setdefault(key, []).append(square <= _CHI2[len(error)])
+                    errors.setdefault(key, []).append(error)
+                    promised.setdefault(key, []).append(np.diagonal(block))
+        for (name, part), hits in inside.items():
+            spread = np.sqrt(np.mean(np.square(errors[name, part]), axis=0))
+            ratio = np.sqrt(np.mean(promised[name, part], axis=0)) / spread
+            share = 100.0 * float(np.mean(hits))
+            rows.append((model, name, part, share, float(ratio.min()), float(ratio.max())))
+    shares, ratios = [row[3] for row in rows], [r for row in rows for r in row[4:]]
+    # What so many runs can show: three standard deviations of a share, and of a spread.
+    slack = 300.0 * float(np.sqrt(0.95 * 0.05 / study.trials)), 3.0 / np.sqrt(2.0 * study.trials)
+    holds = all(abs(s - 95.0) <= max(2.0, slack[0]) for s in shares)
+    close = all(abs(r - 1.0) <= max(0.07, slack[1]) for r in ratios)
+    return Section(
+        "Regions of 95 % in simulated runs",
+        [
+            f"Five views of 30 points, noise {_NOISE:g} px, {study.trials} runs a model; estimates "
+            "are moved to where they agree with the truth in what the datum holds. Share of runs "
+            "with the truth inside, and promised over found standard deviations, least and largest "
+            "of the coordinates.",
+            Table(
+                "coverage",
+                "Coverage of regions of 95 % (%), and ratio of standard deviations.",
+                ("model", "datum", "of", "inside", "ratio, least", "largest"),
+                rows,
+                ("", "", "", ".1f", ".3f"),
+            ),
+        ],
+        [
+            Claim(
+                "not in the paper",
+                "regions of 95 % hold the truth in 95 % of the runs, within two",
+                holds,
+                f"{min(shares):.1f} to {max(shares):.1f} %; {study.trials} runs leave "
+                f"{slack[0]:.1f} (three standard deviations)",
+            ),
+            Claim(
+                "not in the paper",
+                "promised standard deviations are those found, within 7 %",
+                close,
+                f"{min(ratios):.3f} to {max(ratios):.3f}; {study.trials} runs leave {slack[1]:.2f}",
+            ),
+        ],
+    )
+
+
+#: The experiments by name, in the order of the report.
+EXPERIMENTS: dict[str, Callable[[MetrologyStudy], Section]] = {
+    "network": network,
+    "coverage": coverage,
+}
+
+
+def introduction(study: MetrologyStudy) -> list[str]:
+    """Return the paragraphs above the claims."""
+    return [
+        "Covariances of calibrated cameras, their intrinsics and points, checked twice: by the "
+        "report that a commercial program made of a metrology network (AICON; camera model brown, "
+        "every coordinate with its own sigma, a scale bar), and by simulated errors: epigauge "
+        f"reproduce metrology --trials {study.trials} --seed {study.seed}.",
+    ]
+
+
+PAPER = Paper("metrology", "Covariances against a metrology network", EXPERIMENTS, introduction)
