@@ -164,6 +164,10 @@ def tracks_with_errors(
     return eg.Tracks(tracks.view, tracks.point, xy), truth
 
 
+#: A point and its neighbours.
+_STAR = 1e-3 * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+
+
 class TestManyViews:
     @pytest.mark.parametrize(("share", "off"), [(0.0, 0.0), (0.05, 60.0), (0.15, 5.0)])
     @pytest.mark.parametrize("loss", ["huber", "cauchy"])
@@ -186,6 +190,31 @@ class TestManyViews:
             squares = np.einsum("ki,kij,kj->k", error, np.linalg.inv(spread.projections), error)
             found.append(np.mean(np.minimum(squares, 40.0)) / 2.0)
         assert 0.83 <= np.mean(found) <= 1.22
+
+    def test_a_loss_without_influence_leaves_the_variance_of_the_residuals(self) -> None:
+        rng = np.random.default_rng(8)
+        r, w = rng.uniform(-1.0, 1.0, (40, 2)), rng.uniform(0.5, 2.0, 40) * (np.arange(40) > 3)
+        said = influence_of_many(r, w, Loss("huber", 1e6), 11)
+        assert len(said.wrong) == 0
+        np.testing.assert_allclose(said.weights, w, rtol=1e-9)
+        variance = np.sum(w[:, None] * r**2) / (2 * 36 - 11)
+        assert said.kappa * said.noise**2 == pytest.approx(variance, rel=1e-9)
+
+    def test_noise_of_normal_residuals_is_theirs(self) -> None:
+        r = np.random.default_rng(9).standard_normal((20_000, 2))
+        said = influence_of_many(r, np.ones(20_000), Loss("huber", 1.0), 0)
+        assert said.noise == pytest.approx(1.0, abs=0.015)
+
+    @pytest.mark.parametrize("length", [0.2, 0.7])
+    def test_slope_is_the_mean_curvature_of_the_loss(self, length: float) -> None:
+        loss, angle = Loss("cauchy", 1.0), np.arange(6.0)
+        r = length * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        r[5] *= 100.0  # wrong
+        said = influence_of_many(r, np.ones(6), loss, 0)
+        value = [0.5 * loss(np.array([np.sum((r[0] + step) ** 2)]))[0][0] for step in _STAR]
+        laplacian = (sum(value[1:]) - 4.0 * value[0]) / 1e-6
+        assert list(said.wrong) == [5]
+        assert said.weights[0] == pytest.approx(0.5 * laplacian, abs=1e-5)
 
     def test_equals_the_dense_sandwich(self) -> None:
         rng = np.random.default_rng(6)
