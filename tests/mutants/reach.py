@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from runs import child
+from runs import OPTIONS, child
 from scratch import Scratch
 
 #: Longest run of one file of tests while its lines are recorded.
@@ -109,8 +109,7 @@ def _record(root: Path, name: str) -> dict[str, Any]:
     )
     clock = _Clock(recorder)
     recorder.start()
-    options = ["-q", "-p", "no:cacheprovider", "--tb=no", "-m", "not slow"]
-    pytest.main([*options, name], plugins=[clock])
+    pytest.main([*OPTIONS, name], plugins=[clock])
     recorder.stop()
     number = {test: k for k, test in enumerate(clock.tests)}
     found: dict[str, dict[str, list[int]]] = {}

@@ -19,16 +19,21 @@ from scratch import Scratch
 #: What a run of the tests can say.
 PASSED, FAILED, SLOW = "passed", "failed", "too slow"
 
+#: Write nothing, rewrite no assertions: a verdict is all that is wanted.
+OPTIONS = ("-q", "--assert=plain", "--tb=no", "-p", "no:cacheprovider", "-m", "not slow")
+
 #: Slow to import, and used by tests of many files. The library itself is imported by each child.
 _COMMON = (
-    *("numpy", "scipy.optimize", "scipy.stats", "scipy.sparse.linalg"),
-    *("cv2", "casadi", "matplotlib.figure", "typer", "rich.table", "sqlite3"),
+    *("numpy", "scipy.optimize", "scipy.stats", "scipy.sparse.linalg", "hypothesis.extra.numpy"),
+    *("cv2", "casadi", "matplotlib.figure", "typer", "rich.table", "xdist", "sqlite3"),
 )
 
 
 def prepare() -> None:
     """Import what children share; threads of linear algebra would not survive the fork."""
     os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
     for name in _COMMON:
         with contextlib.suppress(ImportError):
             importlib.import_module(name)
@@ -62,8 +67,7 @@ def first_failure(scratch: Scratch, tests: Sequence[str], seconds: float) -> tup
 
     def run() -> Any:
         plugin = _First()
-        options = ["-q", "-x", "-p", "no:cacheprovider", "--tb=no", "-m", "not slow"]
-        code = pytest.main([*options, *tests], plugins=[plugin])
+        code = pytest.main([*OPTIONS, "-x", *tests], plugins=[plugin])
         return int(code), plugin.name
 
     answer = child(scratch, run, seconds)
