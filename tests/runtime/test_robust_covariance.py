@@ -194,27 +194,28 @@ class TestManyViews:
     def test_a_loss_without_influence_leaves_the_variance_of_the_residuals(self) -> None:
         rng = np.random.default_rng(8)
         r, w = rng.uniform(-1.0, 1.0, (40, 2)), rng.uniform(0.5, 2.0, 40) * (np.arange(40) > 3)
-        said = influence_of_many(r, w, Loss("huber", 1e6), 11)
+        fit = RobustFit.of(r, w, Loss("huber", 1e6), 11)
+        said = fit.influence(np.zeros_like(r))
         assert len(said.wrong) == 0
-        np.testing.assert_allclose(said.weights, w, rtol=1e-9)
+        np.testing.assert_allclose(fit.weights, w, rtol=1e-9)
         variance = np.sum(w[:, None] * r**2) / (2 * 36 - 11)
         assert said.kappa * said.noise**2 == pytest.approx(variance, rel=1e-9)
 
     def test_noise_of_normal_residuals_is_theirs(self) -> None:
         r = np.random.default_rng(9).standard_normal((20_000, 2))
-        said = influence_of_many(r, np.ones(20_000), Loss("huber", 1.0), 0)
-        assert said.noise == pytest.approx(1.0, abs=0.015)
+        fit = RobustFit.of(r, np.ones(20_000), Loss("huber", 1.0), 0)
+        assert fit.influence(np.zeros_like(r)).noise == pytest.approx(1.0, abs=0.015)
 
     @pytest.mark.parametrize("length", [0.2, 0.7])
     def test_slope_is_the_mean_curvature_of_the_loss(self, length: float) -> None:
         loss, angle = Loss("cauchy", 1.0), np.arange(6.0)
         r = length * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         r[5] *= 100.0  # wrong
-        said = influence_of_many(r, np.ones(6), loss, 0)
+        fit = RobustFit.of(r, np.ones(6), loss, 0)
         value = [0.5 * loss(np.array([np.sum((r[0] + step) ** 2)]))[0][0] for step in _STAR]
         laplacian = (sum(value[1:]) - 4.0 * value[0]) / 1e-6
-        assert list(said.wrong) == [5]
-        assert said.weights[0] == pytest.approx(0.5 * laplacian, abs=1e-5)
+        assert list(fit.wrong) == [5]
+        assert fit.weights[0] == pytest.approx(0.5 * laplacian, abs=1e-5)
 
     def test_equals_the_dense_sandwich(self) -> None:
         rng = np.random.default_rng(6)
