@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 from epigauge import kernels
 from epigauge.multi_view.sandwich import RobustFit
-from epigauge.two_view.covariance import influence, residual_noise, truncated_deviation
+from epigauge.two_view.covariance import (
+    influence,
+    residual_noise,
+    truncated_deviation,
+    untruncated,
+)
 from epigauge.two_view.losses import Loss
 from two_views import Array, normalizing
 
@@ -117,6 +122,28 @@ class TestNoise:
             found.append(eg.refine_fundamental(x1, x2, loss=loss, noise_px=None).noise_px)
         # A mean of 60 has a deviation of 0.01; without the factor it is 0.95
         assert np.mean(found) == pytest.approx(1.0, abs=0.025)
+
+    @pytest.mark.parametrize("limit", [1.5, 2.5, 3.0, 8.0])
+    def test_deviation_within_a_limit_tells_that_without_it(self, limit) -> None:
+        for sigma in (0.3, 1.0):
+            within = sigma * truncated_deviation(limit)
+            assert untruncated(within, limit * sigma) == pytest.approx(sigma, rel=1e-3)
+        assert untruncated(0.0, 1.0) == 0.0
+
+    def test_an_estimate_gives_back_the_tails_that_its_threshold_cuts_off(self) -> None:
+        x1, x2 = disturbed(np.random.default_rng(2), 0.15, 60.0)
+        found = eg.estimate_fundamental(x1, x2)
+        kept = found.used
+        refined = eg.refine_fundamental(x1[kept], x2[kept], found.F)
+        noise = untruncated(refined.noise_px, found.threshold_px)
+        assert noise > 1.005 * refined.noise_px
+        assert found.noise_px == pytest.approx(noise, rel=1e-6)
+        size = np.abs(refined.covariance).max()
+        factor = (noise / refined.noise_px) ** 2
+        np.testing.assert_allclose(
+            found.covariance / size, factor * refined.covariance / size, atol=1e-5
+        )
+        assert found.sigma_std == pytest.approx(np.sqrt(factor) * refined.sigma_std, rel=1e-3)
 
     @pytest.mark.parametrize("limit", [0.5, 1.0, 2.5, 3.0, 8.0])
     def test_truncated_deviation_is_that_of_a_truncated_normal_variable(self, limit) -> None:

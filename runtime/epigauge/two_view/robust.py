@@ -6,7 +6,7 @@ import importlib
 import importlib.util
 import itertools
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -21,6 +21,7 @@ from epigauge.two_view.chance import CEILING
 from epigauge.two_view.conditioning import RMS, condition
 from epigauge.two_view.consensus import RANGE, Agreement, Consensus
 from epigauge.two_view.copies import earliest
+from epigauge.two_view.covariance import untruncated
 from epigauge.two_view.essential_consensus import EssentialConsensus
 from epigauge.two_view.initial import fundamental_8point
 from epigauge.two_view.losses import robust_scale
@@ -112,7 +113,8 @@ def estimate_fundamental(
         Of everything random: one seed, one answer.
     **options
         Of `refine_fundamental`, but for `F0`. `weights` and covariances are those of all matches;
-        they count in the refinement. `noise_px` is by default estimated.
+        they count in the refinement. `noise_px` is by default estimated, with the factor for
+        the tails that the threshold cuts off.
 
     Returns
     -------
@@ -183,6 +185,14 @@ def estimate_fundamental(
         for entry in fields(refined)
         if entry.name not in ("flags", "success")
     }
+    plain = options["noise_px"] is None and options.get("loss", "linear") == "linear"
+    if plain and refined.noise_px > 0.0:
+        # The threshold has cut off the tails of the right matches.
+        noise_px = untruncated(refined.noise_px, limit_px)
+        factor = noise_px / refined.noise_px
+        spread = replace(refined._uncertainty, root=factor * refined._uncertainty.root)
+        known |= {"noise_px": noise_px, "_uncertainty": spread}
+        known["covariance"] = spread.of_fundamental()
     known |= {
         "inlier": used[copies],
         "used": rows[used],
