@@ -123,6 +123,21 @@ class TestNoise:
         # A mean of 60 has a deviation of 0.01; without the factor it is 0.95
         assert np.mean(found) == pytest.approx(1.0, abs=0.025)
 
+    def test_of_five_matches_and_an_essential_matrix_is_not_known(self) -> None:
+        view = eg.two_view_scene(6.0, n_points=5, seed=1)
+        options = {"essential": True, "K1": view.K, "K2": view.K}
+        found = eg.refine_fundamental(view.x1, view.x2, **options)
+        assert found.noise_px == np.inf
+        assert np.isinf(np.diag(found.covariance)).all()
+        assert not np.isnan(found.covariance).any()
+        assert np.isinf(found.sigma_std)
+        assert np.isinf(found.epipole_px_covariance(1)).any()
+        assert "few matches" in found.flags
+        assert "weak geometry" not in found.flags
+        known = eg.refine_fundamental(view.x1, view.x2, noise_px=1.0, **options)
+        assert np.isfinite(known.covariance).all()
+        assert known.rank == found.rank == 5
+
     @pytest.mark.parametrize("limit", [1.5, 2.5, 3.0, 8.0])
     def test_deviation_within_a_limit_tells_that_without_it(self, limit) -> None:
         for sigma in (0.3, 1.0):

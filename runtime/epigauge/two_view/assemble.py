@@ -70,19 +70,23 @@ def assembled(
     residual = residual_noise(distances.signed, weights, loss, chart.dimension)
     if noise_px is None:
         noise = found.evidence.noise if matches.covariances is None else residual
-        noise_px = noise * frame.scale
+        redundant = int(np.count_nonzero(weights > 0.0)) > chart.dimension
+        noise_px = noise * frame.scale if redundant else float("inf")
     a, b = influence(distances.signed, weights, loss, chart.dimension, residual)
     # Derivatives are by F of the norm it has inside; those by F of unit norm are so much larger.
     norm = float(np.linalg.norm(solution.F))
     unit = solution.F / norm
     restricted = chart.dimension < 7
+    known_noise = noise_px / frame.scale if np.isfinite(noise_px) else 1.0
     uncertainty = fundamental_covariance(
         unit,
         norm**2 * (feet_by_entries * a) @ feet_by_entries.T,
-        norm**2 * (noise_px / frame.scale) ** 2 * (feet_by_entries * b) @ feet_by_entries.T,
+        norm**2 * known_noise**2 * (feet_by_entries * b) @ feet_by_entries.T,
         frame.maps_from_pixels(),
         restricted_basis(unit, derivatives) if restricted else tangent_basis(unit),
     )
+    if not np.isfinite(noise_px):
+        uncertainty = uncertainty.of_unknown_noise()
     jac = frame.scale * criterion.derivative(solution.F, distances) @ derivatives
     fun = frame.scale * distances.signed
     grad = jac.T @ (weight * fun)

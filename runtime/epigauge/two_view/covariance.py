@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -72,6 +72,12 @@ class Uncertainty:
         """F in pixels of any scale, and the derivative (9, 9) of vect of it by vect(F)."""
         entry_map = np.kron(self.to_units2.T, self.to_units1.T)
         return self.to_units2.T @ self.F @ self.to_units1, np.asarray(entry_map, dtype=np.float64)
+
+    def of_unknown_noise(self) -> Uncertainty:
+        """Return this with all of its directions undetermined: nothing was redundant."""
+        U, _, _ = np.linalg.svd(self.root, full_matrices=False)
+        directions = np.column_stack([U, self.undetermined])
+        return replace(self, root=self.root[:, :0], undetermined=directions)
 
     def of_fundamental(self) -> Array:
         """Return the covariance (9, 9) of vect(F) in pixels, F of unit norm."""

@@ -49,7 +49,9 @@ class FundamentalResult(Partial):
     condition : float
         Largest over smallest standard deviation among them, in conditioned coordinates.
     noise_px : float
-        Standard deviation of a coordinate that the covariance was computed with.
+        Standard deviation of a coordinate that the covariance was computed with. Infinite, as the
+        covariance, where it was to be estimated and nothing is redundant (an essential matrix from
+        five matches).
     rms_px : float
         sqrt(sum of squared residual coordinates / (4 m)), whatever criterion and loss, over the
         matches of positive weight.
@@ -157,7 +159,8 @@ class FundamentalResult(Partial):
 
     def judged(self, found: Evidence) -> SimpleNamespace:
         """Return `flags` and `success` by some evidence."""
-        largest = self._uncertainty.largest()
+        # Where nothing is redundant the noise is not known: "few matches".
+        largest = self._uncertainty.largest() if np.isfinite(self.noise_px) else 0.0
         if np.isfinite(largest) and self.noise_px > 0.0:
             largest *= found.noise / found.to_units1[0, 0] / self.noise_px
         flags = diagnose(found, largest, self.ambiguous)
