@@ -287,6 +287,8 @@ def test_every_method_reaches_the_same_cost(method: str) -> None:
         ({"priors": [eg.IntrinsicPrior(0, "k9", 0.0, 1.0)]}, "k9"),
         ({"priors": [eg.IntrinsicPrior(1, "f", 0.0, 1.0)]}, "camera"),
         ({"priors": [eg.IntrinsicPrior(0, "f", 1.0, 0.0)]}, "sigma"),
+        ({"priors": [eg.IntrinsicPrior(0, "f", np.nan, 1.0)]}, "value.*finite"),
+        ({"priors": [eg.IntrinsicPrior(0, "f", [1.0, 2.0], 1.0)]}, "value.*finite"),
         ({"priors": [PRIORS[2]], "refine": "pose"}, "fixes"),
         ({"priors": [PRIORS[0]], "fixed_views": [1]}, "fixed"),
         ({"priors": ["GPS"]}, "str"),
