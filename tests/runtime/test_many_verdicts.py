@@ -80,6 +80,7 @@ def test_undetermined_networks_end_flagged(kind: str, m: int) -> None:
     found = eg.bundle_adjust(tracks, start)
     assert "undetermined" in found.flags
     assert not found.success
+    assert found.condition == np.inf
     # Two views with all their matches fix 7 numbers, and 11 n - 15 are needed.
     assert found.rank <= 7 * len(edges) + 3 * tracks.n_points
 
@@ -93,6 +94,7 @@ def test_pairs_of_all_views_are_solved(n: int, seed: int) -> None:
     assert found.success
     assert found.flags == ()
     assert found.rank == 11 * n + 3 * tracks.n_points - 15
+    assert 1.0 <= found.condition < 1e8
     # At the minimum each pair has 60 - 7 squares of noise; the cameras' have 15 - 11 n less.
     degrees = 60 * len(edges) - (11 * n - 15)
     assert found.cost / 0.5 == pytest.approx(0.3**2 * degrees, rel=4 * (2 / degrees) ** 0.5)
