@@ -382,3 +382,18 @@ def test_pruned_refuses_another_word() -> None:
     _, view, point, xy = _with_seconds()
     with pytest.raises(ArgumentError, match="repeated"):
         eg.Tracks.pruned(view, point, xy, repeated="last")
+
+
+def test_what_no_reconstruction_shows_is_kept_as_it_comes_first() -> None:
+    # The last view is seen twice throughout: without its repetitions there is nothing of it.
+    tracks, view, point, xy = _with_seconds()
+    again = tracks.view == 4
+    view, point = (
+        np.concatenate([a, b[again]]) for a, b in ((view, tracks.view), (point, tracks.point))
+    )
+    xy = np.concatenate([xy, tracks.xy[again] + 40.0])
+    found, views, _ = eg.Tracks.pruned(view, point, xy, repeated="best")
+    assert views.tolist() == list(range(5))
+    first, _, _ = eg.Tracks.pruned(view, point, xy, repeated="first")
+    np.testing.assert_array_equal(found.xy[found.view == 4], first.xy[first.view == 4])
+    np.testing.assert_array_equal(found.xy[found.view < 4], tracks.xy[tracks.view < 4])
