@@ -75,9 +75,8 @@ def diagnosed(
     whitening = np.linalg.inv(np.swapaxes(np.linalg.cholesky(W.cameras), 1, 2))
     ties = system.ties.then(whitening, None).scaled(1.0 / np.sqrt(W.shared))
     size = np.einsum("mii->mi", W.points)
-    least = np.linalg.eigvalsh(system.V / np.sqrt(size[:, :, None] * size[:, None, :]))
     free = ~known
-    of_points = int(np.count_nonzero(least[free] <= _ROUNDING))
+    of_points = _open(system.V[free] / np.sqrt(size[:, :, None] * size[:, None, :])[free])
     white = congruent(ties.A, system.normal.U)
     a, r = white.shape[1], ties.n_shared
     frozen = 0 if system.ties.A is None else int(np.count_nonzero(~system.ties.A.any(axis=1)))
@@ -125,6 +124,23 @@ def _factored(
         except np.linalg.LinAlgError:
             continue
     return None
+
+
+def _open(blocks: Array) -> int:
+    """Return how many eigenvalues of blocks (k, b, b), all together, are rounding.
+
+    Eigenvalues are computed of those only whose determinant may be that of such a block: the
+    others' product is at most (trace / (b - 1))^(b - 1).
+    """
+    b = blocks.shape[1]
+    most = np.maximum(np.einsum("kii->k", blocks) / max(b - 1, 1), 1.0) ** (b - 1)
+    if b == 3:
+        rows = np.cross(blocks[:, 0], blocks[:, 1])
+        determinants = np.einsum("ki,ki->k", rows, blocks[:, 2])
+    else:
+        determinants = np.linalg.det(blocks)
+    doubtful = blocks[~(determinants > 100.0 * _ROUNDING * most)]
+    return int(np.count_nonzero(np.linalg.eigvalsh(doubtful) <= _ROUNDING))
 
 
 def _free_gauge(system: BundleSystem, kernels: Table) -> int:

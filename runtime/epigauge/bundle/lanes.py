@@ -175,9 +175,9 @@ def _together(graph: ObservationGraph, counts: Indices) -> Indices:
 def _chunks(counts: Indices) -> tuple[Indices, Indices]:
     """Return where the lanes and the rows of each chunk begin, for falling counts."""
     lanes, rows = [0], [0]
-    begin, m = 0, len(counts)
+    begin, m, all_slots = 0, len(counts), counts.tolist()
     while begin < m:
-        slots = int(counts[begin])
+        slots = all_slots[begin]
         width = min(max(_ROWS // slots // LANES * LANES, LANES), _MOST_LANES)
         width = min(width, -(-(m - begin) // LANES) * LANES)
         lanes.append(lanes[-1] + width)

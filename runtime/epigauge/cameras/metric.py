@@ -21,6 +21,9 @@ Array = NDArray[np.float64]
 #: How far R^T R may be from the identity.
 ORTHONORMAL = 1e-8
 
+#: Observations projected at a time: what they take stays in the cache.
+_BLOCK = 4096
+
 
 @dataclass(frozen=True, eq=False)
 class MetricReconstruction:
@@ -145,6 +148,22 @@ class MetricReconstruction:
         """
         return np.asarray(self._images(tracks, backend)[1])
 
+    def seen(self, tracks: Tracks) -> tuple[Array, Array]:
+        """Return what `project` and `depths` return, computed once.
+
+        Parameters
+        ----------
+        tracks : Tracks
+            Which point is seen in which view.
+
+        Returns
+        -------
+        pixels, depths : ndarray, shape (N, 2), (N,)
+            As there.
+        """
+        pixels, depths = self._images(tracks, None)
+        return np.ascontiguousarray(pixels.T), depths
+
     def rms_px(self, tracks: Tracks) -> float:
         """Return the root mean square of the residual coordinates.
 
@@ -178,9 +197,15 @@ class MetricReconstruction:
             was = f"are of {tracks.n_views} views and {tracks.n_points} points"
             raise ArgumentError("tracks", was, f"{self.n_views} and {self.n_points}, as here")
         project = camera_model(self.cameras.model).kernel("project", backend)
-        with np.errstate(all="ignore"):
-            pair: tuple[Array, Array] = project(self.vectors[tracks.view].T, self.X[tracks.point].T)
-        return pair
+        cameras, points = (np.ascontiguousarray(rows.T) for rows in (self.vectors, self.X))
+        pixels, depths = np.empty((2, len(tracks))), np.empty(len(tracks))
+        for begin in range(0, len(tracks), _BLOCK):
+            part = slice(begin, begin + _BLOCK)
+            view, point = tracks.view[part], tracks.point[part]
+            with np.errstate(all="ignore"):
+                seen = project(np.take(cameras, view, axis=1), np.take(points, point, axis=1))
+            pixels[:, part], depths[part] = seen
+        return pixels, depths
 
     def _calibrations(self) -> Array:
         """Return K of each view, from image and derivative on the optical axis."""

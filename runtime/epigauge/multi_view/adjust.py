@@ -300,18 +300,25 @@ def bundle_adjust(
         fixed = np.zeros(tracks.n_points, dtype=np.bool_)
         fixed[stays[1]] = True
         reference = bool(STRATEGIES[method].reference)
-        parts = table, fixed, job.fixes_gauge or reference
-        verdict = judged_metric(tracks, reconstruction, outcome, *parts)
+        if isinstance(reconstruction, MetricReconstruction):
+            predicted, depths = reconstruction.seen(tracks)
+        else:
+            predicted, depths = reconstruction.project(tracks), None
+        free = fixed, job.fixes_gauge or reference
+        verdict = judged_metric(tracks, depths, outcome, table, *free)
     else:
         how = loss == "linear", table, workers, stays if job.fixes_gauge else None
         verdict = judged(tracks, reconstruction, rejected, *how)
-    unit = job.scale_px**2
-    return _result(tracks, reconstruction, outcome, unit, verdict, rejected, method, scale_px)
+        predicted = reconstruction.project(tracks)
+    unit, residuals = job.scale_px**2, tracks.xy - predicted
+    parts = outcome, unit, verdict, rejected, method, scale_px
+    return _result(tracks, reconstruction, residuals, *parts)
 
 
 def _result(
     tracks: Tracks,
     reconstruction: AnyReconstruction,
+    residuals: NDArray[np.float64],
     outcome: lm.Outcome[Any],
     unit: float,
     verdict: Verdict,
@@ -320,7 +327,6 @@ def _result(
     scale_px: float,
 ) -> BundleResult:
     """Return the result; `unit` is that of the outcome's cost in square pixels."""
-    residuals = tracks.xy - reconstruction.project(tracks)
     return BundleResult(
         reconstruction=reconstruction,
         rms_px=float(np.sqrt(np.mean(residuals[tracks.weights > 0.0] ** 2))),

@@ -21,7 +21,7 @@ from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.problem import BundleState, Estimate
 from epigauge.bundle.run import bundle_problem
 from epigauge.bundle.solve import Bordered, BundleSystem, Iterated, reduced_system
-from epigauge.cameras import AffineReconstruction, MetricReconstruction, camera_model
+from epigauge.cameras import camera_model
 from epigauge.kernels import Table
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import normalized
@@ -189,7 +189,7 @@ def _extent(xy: Array) -> float:
 
 def judged_metric(
     tracks: Tracks,
-    found: MetricReconstruction | AffineReconstruction,
+    depths: Array | None,
     outcome: lm.Outcome[BundleState],
     kernels: Table,
     known: Mask,
@@ -201,8 +201,9 @@ def judged_metric(
     ----------
     tracks : Tracks
         Observations.
-    found : MetricReconstruction or AffineReconstruction
-        Cameras and points, at the minimum.
+    depths : ndarray, shape (N,), or None
+        How far in front of its camera each observed point lies at the minimum; None where cameras
+        have no front.
     outcome : Outcome
         How the minimisation ended.
     kernels : Table
@@ -218,10 +219,8 @@ def judged_metric(
         Flags, rank, condition and weakest direction, and the number of observations that are not in
         front of their camera.
     """
-    # Affine cameras have no front.
-    n_behind, metric = 0, False
-    if isinstance(found, MetricReconstruction):
-        n_behind, metric = int(np.count_nonzero(~(found.depths(tracks) > 0.0))), True
+    metric = depths is not None
+    n_behind = 0 if depths is None else int(np.count_nonzero(~(depths > 0.0)))
     raised = ["behind the cameras"] if n_behind > BEHIND * len(tracks) else []
     system, rank = outcome.system, 0
     condition, weakest = float("inf"), ""
