@@ -67,7 +67,7 @@ int eg_bundle_linearize(
     const eg_route route = eg_route_of(bundle);
     const ptrdiff_t b = route.point, block = b * (b + 1) / 2;
     eg_pass p;
-    if (eg_pass_begin(&p, bundle, &route, begin, end, route.sums, 0))
+    if (eg_pass_begin(&p, bundle, &route, begin, end, route.sums + route.kept, 0))
         return 1;
     for (ptrdiff_t c = begin; c < end; ++c) {
         eg_pass_chunk(&p, c, points);
@@ -76,6 +76,7 @@ int eg_bundle_linearize(
         if (route.factored)
             eg_moments(M, p.points, p.moments);
         memset(sums, 0, (size_t)size * sizeof(double));
+        eg_pass_keep(&p, 0, sums + size);
         for (ptrdiff_t s = 0; s < p.chunk.L; ++s) {
             eg_pass_slot(&p, s, cameras);
             route.observe(&p, sums, camera_sums);

@@ -51,9 +51,9 @@ typedef struct {
 #define EG_FACTORED (-1)
 
 /* How points are refined on their own: most iterations, first lambda and what it is divided or
-   multiplied by, relative decrease that ends it; damping by tr(V) / 3 I or V (not of the factored
-   route, which adds the blocks of depths to V). */
-enum { EG_TRACE, EG_BLOCK };
+   multiplied by, relative decrease that ends it; damping by tr(V) / b I or V. The factored route adds
+   to V the blocks of depths. */
+enum { EG_TRACE, EG_BLOCK, EG_DEPTHS };
 typedef struct {
     ptrdiff_t iterations, damping;
     double lam, factor, tolerance;
@@ -99,6 +99,11 @@ EG_EXPORT int eg_bundle_schur(
     const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras,
     const double *points, const double *T, const double *half, const eg_envelope *envelope,
     double *pairs, double *reduced);
+
+int eg_bundle_eliminate(
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras,
+    const double *points, double lam, int damping, const eg_envelope *envelope, double *V, double *D,
+    double *g, double *T, double *half, double *camera_sums, double *pairs, double *reduced);
 
 EG_EXPORT int eg_bundle_couple(
     const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras,

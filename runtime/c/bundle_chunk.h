@@ -41,6 +41,7 @@ typedef struct {
     const double *q, *weights;
     double *loss, *squared, *w; /* 3 M, M, M: the loss, squared residuals, weights */
     double *work;
+    double *kept;  /* what is kept of the slot, for `turn` */
     double *extra; /* what the caller has asked for */
 } eg_pass;
 
@@ -55,31 +56,35 @@ struct eg_route {
     ptrdiff_t camera_sums;   /* doubles a camera */
     eg_blocks pair_sums;     /* how the sums of pairs of cameras are stored */
     ptrdiff_t sums;          /* rows of a point's sums: V, its damping where it has one, g */
-    ptrdiff_t factors;       /* rows an observation that `turn` keeps of a chunk */
+    ptrdiff_t kept;          /* rows that are kept of an observation */
     ptrdiff_t turned;        /* doubles an observation when pairs are added */
     ptrdiff_t work;          /* rows of scratch */
     /* Squared residuals. */
     void (*squared)(const eg_pass *);
     /* Add to the sums of points; weights, squared residuals. */
     void (*sight)(const eg_pass *, const double *points, double *sums);
-    /* The same, and add to the sums of cameras. */
-    void (*observe)(const eg_pass *, double *sums, double *cameras);
+    /* Evaluate a slot for `turn`, and for `observe`, which adds to the sums of points and cameras. */
+    void (*evaluate)(eg_pass *);
+    void (*observe)(eg_pass *, double *sums, double *cameras);
     /* v += (W T)^T x for x of the cameras, (tangent, M). */
     void (*to_points)(const eg_pass *, const double *roots, const double *x, double *v);
     /* cameras += W T v. */
     void (*to_cameras)(const eg_pass *, const double *roots, const double *v, double *cameras);
-    /* Turn the factors W T of a chunk into those of a group, behind what it has; cameras += W T v
-       unless v is NULL. May add pairs on its own, and leave the group as it is. */
-    void (*turn)(eg_pass *, const double *cameras, const double *roots, const double *v,
-                 const eg_envelope *, eg_group *, double *pairs, double *reduced);
+    /* Turn the factors W T of a chunk, what is kept of its first slot being at `kept`, into those of a
+       group, behind what it has; cameras += W T v unless v is NULL. May add pairs on its own, and
+       leave the group as it is. */
+    void (*turn)(eg_pass *, const double *roots, const double *v, double *kept, const eg_envelope *,
+                 eg_group *, double *pairs, double *cameras);
     /* Add W T T^T W^T of all pairs of observations of each point of a group to their pairs of
        views. */
     void (*pairs)(const eg_route *, const eg_envelope *, eg_group *, double *pairs);
-    /* Of the direct route, for its width of rows: add residuals r and Jacobians J of a slot to the
-       sums of its cameras; turn those of slot s, lanes beginning at `first` in the group. */
-    void (*add_cameras)(const eg_pass *, const double *r, const double *J, double *cameras);
-    void (*turn_slot)(const eg_pass *, const double *J, const double *Z, const double *v,
-                      const int32_t *first, ptrdiff_t s, eg_group *, double *reduced);
+    /* Of the direct route, for its width of rows: turn Jacobians J of a slot, lane by lane; add them
+       and residuals r to the sums of cameras; turn those of slot s, lanes beginning at `first` in the
+       group. */
+    void (*turn_cameras)(const eg_pass *, const double *J);
+    void (*add_cameras)(const eg_pass *, const double *r, double *cameras);
+    void (*turn_slot)(const eg_pass *, const double *Z, const double *v, const int32_t *first,
+                      ptrdiff_t s, eg_group *, double *cameras);
 };
 
 /* In bundle_factored.c and bundle_direct.c. */
@@ -237,6 +242,12 @@ static inline void eg_pass_slot(eg_pass *p, ptrdiff_t s, const double *cameras)
 {
     eg_pass_slot_of(p, s, p->points + p->route->point * p->chunk.M);
     eg_gather(p->chunk.M, p->route->camera, cameras, p->view, p->cameras);
+}
+
+/* Keep what is evaluated of slot s behind that of the slots before, its weights first. */
+static inline void eg_pass_keep(eg_pass *p, ptrdiff_t s, double *kept)
+{
+    p->kept = p->w = kept + p->route->kept * s * p->chunk.M;
 }
 
 /* Weights in the normal equations of a slot, given its squared residuals unless the loss is

@@ -47,15 +47,23 @@ static void sight(const eg_pass *p, const double *points, double *sums)
     add_points(p, r, J, sums);
 }
 
-static void observe(const eg_pass *p, double *sums, double *cameras)
+/* Kept of an observation: its weight, J_point (2, b), and J_camera turned. */
+static void evaluate(eg_pass *p)
 {
     const ptrdiff_t M = p->chunk.M;
-    double *r = p->work, *J = r + 2 * M, *J_camera = J + 2 * p->route->point * M;
-    eg_model_of(p)->observe(M, p->cameras, p->points, p->q, r, J_camera, J);
-    square(p, r);
+    double *r = p->work, *J_camera = r + 2 * M;
+    eg_model_of(p)->observe(M, p->cameras, p->points, p->q, r, J_camera, p->kept + M);
+    if (p->bundle->loss != EG_LINEAR)
+        square(p, r);
     eg_weigh(p);
-    add_points(p, r, J, sums);
-    p->route->add_cameras(p, r, J_camera, cameras);
+    p->route->turn_cameras(p, J_camera);
+}
+
+static void observe(eg_pass *p, double *sums, double *cameras)
+{
+    evaluate(p);
+    add_points(p, p->work, p->kept + p->chunk.M, sums);
+    p->route->add_cameras(p, p->work, cameras);
 }
 
 /* The Jacobians of the camera (2, tangent of the model) and of the point (2, b), and weights. */
@@ -125,40 +133,34 @@ static void to_cameras(const eg_pass *p, const double *roots, const double *v, d
     }
 }
 
-/* Z = w J_point T, (2, b), of each lane, behind the Jacobians; returns those of the camera. */
-static const double *points_turned(const eg_pass *p, const double *roots, double *Z)
-{
-    const ptrdiff_t M = p->chunk.M, b = p->route->point;
-    const double *J_camera = jacobians(p), *J = p->work + 2 * M, *EG_RESTRICT w = p->w;
-    for (ptrdiff_t i = 0; i < 2 * b; ++i) {
-        double *EG_RESTRICT z = Z + i * M;
-        const double *EG_RESTRICT T = roots + i % b * M, *EG_RESTRICT x = J + i / b * b * M;
-        EG_SIMD
-        for (ptrdiff_t j = 0; j < M; ++j)
-            z[j] = x[j] * T[j];
-        for (ptrdiff_t l = 1; l < b; ++l) {
-            EG_SIMD
-            for (ptrdiff_t j = 0; j < M; ++j)
-                z[j] += x[l * M + j] * T[l * b * M + j];
-        }
-        EG_SIMD
-        for (ptrdiff_t j = 0; j < M; ++j)
-            z[j] *= w[j];
-    }
-    return J_camera;
-}
-
-static void turn(eg_pass *p, const double *cameras, const double *roots, const double *v,
-                 const eg_envelope *envelope, eg_group *group, double *pairs, double *reduced)
+static void turn(eg_pass *p, const double *roots, const double *v, double *kept,
+                 const eg_envelope *envelope, eg_group *group, double *pairs, double *cameras)
 {
     (void)envelope, (void)pairs;
-    const ptrdiff_t b = p->route->point, d = eg_model_of(p)->tangent_size;
-    double *Z = p->work + (2 + 2 * b + 2 * d) * p->chunk.M;
+    const ptrdiff_t M = p->chunk.M, b = p->route->point;
     const int32_t *first = group->first + group->lanes;
     eg_group_append(group, &p->chunk);
     for (ptrdiff_t s = 0; s < p->chunk.L; ++s) {
-        eg_pass_slot(p, s, cameras);
-        p->route->turn_slot(p, points_turned(p, roots, Z), Z, v, first, s, group, reduced);
+        eg_pass_slot_of(p, s, p->cameras);
+        eg_pass_keep(p, s, kept);
+        const double *EG_RESTRICT w = p->w, *J = p->kept + M;
+        double *Z = p->work; /* w J_point T, (2, b) */
+        for (ptrdiff_t i = 0; i < 2 * b; ++i) {
+            double *EG_RESTRICT z = Z + i * M;
+            const double *EG_RESTRICT T = roots + i % b * M, *EG_RESTRICT x = J + i / b * b * M;
+            EG_SIMD
+            for (ptrdiff_t j = 0; j < M; ++j)
+                z[j] = x[j] * T[j];
+            for (ptrdiff_t l = 1; l < b; ++l) {
+                EG_SIMD
+                for (ptrdiff_t j = 0; j < M; ++j)
+                    z[j] += x[l * M + j] * T[l * b * M + j];
+            }
+            EG_SIMD
+            for (ptrdiff_t j = 0; j < M; ++j)
+                z[j] *= w[j];
+        }
+        p->route->turn_slot(p, Z, v, first, s, group, cameras);
     }
 }
 
@@ -185,9 +187,11 @@ eg_route eg_direct_route(const eg_bundle *bundle)
         .pair_sums = {K, padded * K, padded},
         .sums = b * (b + 1) / 2 + b,
         .turned = b * padded,
-        .work = 2 + 2 * d + 4 * b + 2 * padded,
+        .work = 2 + 2 * d + 2 * b,
+        .kept = 1 + 2 * b + 2 * padded,
         .squared = squared,
         .sight = sight,
+        .evaluate = evaluate,
         .observe = observe,
         .to_points = to_points,
         .to_cameras = to_cameras,

@@ -20,10 +20,11 @@ static void sight(const eg_pass *p, const double *points, double *sums)
 }
 
 /* Sums of a camera: for the six entries of w a^T a and for depth the moments Q Q^T, then e Q^T. */
-static void observe(const eg_pass *p, double *sums, double *cameras)
+static void observe(eg_pass *p, double *sums, double *cameras)
 {
     const ptrdiff_t M = p->chunk.M;
     double *factors = p->work;
+    memcpy(p->kept + M, p->cameras, (size_t)(12 * M) * sizeof(double));
     sight(p, p->points, sums);
     eg_camera_normal(M, p->cameras, p->points, p->q, p->w, factors, factors + 6 * M,
                      factors + 7 * M);
@@ -36,6 +37,15 @@ static void observe(const eg_pass *p, double *sums, double *cameras)
         eg_accumulate_one(next - j, factor + 6 * M, moment, sum + 6 * 8, low + 6 * 4);
         eg_accumulate_points(next - j, factor + 7 * M, M, moment, sum + 7 * EG_MOMENTS);
     }
+}
+
+/* Kept of an observation: its weight, then its camera. */
+static void evaluate(eg_pass *p)
+{
+    memcpy(p->kept + p->chunk.M, p->cameras, (size_t)(12 * p->chunk.M) * sizeof(double));
+    if (p->bundle->loss != EG_LINEAR)
+        squared(p);
+    eg_weigh(p);
 }
 
 /* F = w a^T a P T, (3, 4). */
@@ -116,26 +126,28 @@ static void append(const eg_pass *p, const double *F, eg_group *group)
     for (ptrdiff_t s = 0; s < chunk->L; ++s)
         for (ptrdiff_t j = 0; j < lanes && s < chunk->count[j]; ++j)
             for (ptrdiff_t k = 0; k < 12; ++k)
-                group->turned[12 * (first[j] + s) + k] = F[(12 * s + k) * M + j];
+                group->turned[12 * (first[j] + s) + k] = F[(13 * s + k) * M + j];
 }
 
-static void turn(eg_pass *p, const double *cameras, const double *roots, const double *v,
-                 const eg_envelope *envelope, eg_group *group, double *pairs, double *reduced)
+/* The factors take the place of the cameras. */
+static void turn(eg_pass *p, const double *roots, const double *v, double *kept,
+                 const eg_envelope *envelope, eg_group *group, double *pairs, double *cameras)
 {
     const ptrdiff_t M = p->chunk.M, lanes = alike(&p->chunk);
-    double *F = p->extra + 20 * M; /* behind v and roots */
-    eg_moments(M, p->points, p->moments);
+    double *seen_by = p->cameras;
     for (ptrdiff_t s = 0; s < p->chunk.L; ++s) {
-        double *own = F + 12 * s * M;
-        eg_pass_slot(p, s, cameras);
-        couple(p, roots, own);
+        eg_pass_slot_of(p, s, seen_by);
+        eg_pass_keep(p, s, kept);
+        double *own = p->kept + M;
+        memcpy(seen_by, own, (size_t)(12 * M) * sizeof(double));
+        eg_coupling(M, seen_by, p->points, p->w, roots, own);
         if (v)
-            add_to_cameras(p, own, v, reduced);
+            add_to_cameras(p, own, v, cameras);
     }
     if (lanes)
-        eg_factored_pairs_alike(p, envelope, lanes, F, pairs);
+        eg_factored_pairs_alike(p, envelope, lanes, kept + M, pairs);
     else
-        append(p, F, group);
+        append(p, kept + M, group);
 }
 
 const eg_route eg_factored_route = {
@@ -147,11 +159,12 @@ const eg_route eg_factored_route = {
     .camera_sums = EG_CAMERA,
     .pair_sums = {.d = 12, .size = EG_PAIR},
     .sums = 24,
-    .factors = 12,
+    .kept = 13,
     .turned = 12,
     .work = 10 + 24,
     .squared = squared,
     .sight = sight,
+    .evaluate = evaluate,
     .observe = observe,
     .to_points = to_points,
     .to_cameras = to_cameras,

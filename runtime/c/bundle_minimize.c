@@ -16,7 +16,9 @@ typedef struct {
     ptrdiff_t n, m, d, b;
     int failed;      /* memory ran out */
     double lam;      /* of the step being made */
-    double *statuses; /* of the parts of a pass: not zero where one failed */
+    double reduced_for; /* lambda of the pairs and roots that there are */
+    int singular;    /* these failed: a block of a point is not positive definite */
+    double *statuses; /* of the parts of a pass, 0 where it was done */
     double *cameras, *points;             /* the estimate */
     double *trial_cameras, *trial_points; /* refined already */
     double *costs;                        /* of the trial's points */
@@ -34,7 +36,7 @@ static double total(state *s, const double *costs)
     return 0.5 * sum;
 }
 
-/* Do all parts of a pass; returns 1 where one failed. */
+/* Do all parts of a pass; returns their statuses. */
 static int together(state *s, eg_part *part, ptrdiff_t count)
 {
     int failed = 0;
@@ -44,7 +46,7 @@ static int together(state *s, eg_part *part, ptrdiff_t count)
         for (ptrdiff_t k = 0; k < count; ++k)
             part(s, k);
     for (ptrdiff_t k = 0; k < count; ++k)
-        failed |= s->statuses[k] != 0.0;
+        failed |= (int)s->statuses[k];
     return failed;
 }
 
@@ -127,12 +129,57 @@ static void linearize_part(void *self, ptrdiff_t k)
                                          s->D_points, s->g_points, sums);
 }
 
-static eg_lm_system linearize(void *self)
+/* Sums of pairs and cameras of a part, zero to begin with. */
+static double *pairs_of(state *s, ptrdiff_t k)
+{
+    const ptrdiff_t size = s->views->slot[s->n] * s->route.pair_sums.size;
+    return memset(s->pairs + k * size, 0, (size_t)size * sizeof(double));
+}
+
+static double *coupled_of(state *s, ptrdiff_t k)
+{
+    const ptrdiff_t size = s->n * s->d;
+    return memset(s->coupled_cameras + k * size, 0, (size_t)size * sizeof(double));
+}
+
+static void eliminate_part(void *self, ptrdiff_t k)
+{
+    state *s = self;
+    const ptrdiff_t *edge = s->options->pairs + k, size = s->n * s->route.camera_sums;
+    double *sums = s->sums + k * size;
+    memset(sums, 0, (size_t)size * sizeof(double));
+    s->statuses[k] = eg_bundle_eliminate(
+        s->bundle, edge[0], edge[1], s->cameras, s->points, s->lam,
+        (int)s->options->refinement.damping, s->views, s->V, s->D_points, s->g_points, s->T, s->half,
+        sums, pairs_of(s, k), coupled_of(s, k));
+}
+
+/* Add up what the parts of a pass have summed over pairs. */
+static void add_pairs(state *s)
+{
+    const ptrdiff_t parts = s->options->n_pairs;
+    add_parts(parts, s->views->slot[s->n] * s->route.pair_sums.size, s->pairs);
+    add_parts(parts, s->n * s->d, s->coupled_cameras);
+    s->reduced_for = s->lam;
+}
+
+static eg_lm_system linearize(void *self, double lam)
 {
     state *s = self;
     eg_lm_system system = {0.0, 0.0, INFINITY};
-    pass(s, linearize_part);
-    add_parts(s->options->n_passes, s->n * s->route.camera_sums, s->sums);
+    s->reduced_for = -1.0;
+    s->singular = 0;
+    if (lam > 0.0) {
+        s->lam = lam;
+        const int statuses = together(s, eliminate_part, s->options->n_pairs);
+        s->failed |= statuses & 1;
+        s->singular = statuses & 2;
+        add_parts(s->options->n_pairs, s->n * s->route.camera_sums, s->sums);
+        add_pairs(s);
+    } else {
+        pass(s, linearize_part);
+        add_parts(s->options->n_passes, s->n * s->route.camera_sums, s->sums);
+    }
     eg_bundle_camera_blocks(s->bundle, s->sums, s->U, s->D, s->g);
     for (ptrdiff_t k = 0; k < s->n * s->d; ++k)
         system.steepest = fmax(system.steepest, fabs(s->g[k]));
@@ -201,13 +248,9 @@ static void roots_part(void *self, ptrdiff_t k)
 static void schur_part(void *self, ptrdiff_t k)
 {
     state *s = self;
-    const ptrdiff_t *edge = s->options->pairs + k, unknowns = s->n * s->d;
-    const ptrdiff_t size = s->views->slot[s->n] * s->route.pair_sums.size;
-    double *pairs = s->pairs + k * size, *coupled = s->coupled_cameras + k * unknowns;
-    memset(pairs, 0, (size_t)size * sizeof(double));
-    memset(coupled, 0, (size_t)unknowns * sizeof(double));
+    const ptrdiff_t *edge = s->options->pairs + k;
     s->statuses[k] = eg_bundle_schur(s->bundle, edge[0], edge[1], s->cameras, s->points, s->T,
-                                     s->half, s->views, pairs, coupled);
+                                     s->half, s->views, pairs_of(s, k), coupled_of(s, k));
 }
 
 static void couple_part(void *self, ptrdiff_t k)
@@ -257,17 +300,19 @@ static double step_of_cameras(state *s)
 static int make_step(void *self, double lam, double *norm)
 {
     state *s = self;
-    const ptrdiff_t n = s->n, m = s->m, d = s->d, b = s->b, parts = s->options->n_pairs;
+    const ptrdiff_t m = s->m, b = s->b;
     const volatile int *stop = s->options->stop;
     if (s->failed || (stop && *stop))
         return EG_STEP_HOPELESS;
-    s->lam = lam;
-    if (whiten(s, lam) || together(s, roots_part, s->options->n_passes))
-        return EG_STEP_SINGULAR;
-    s->failed |= together(s, schur_part, parts);
-    add_parts(parts, s->views->slot[n] * s->route.pair_sums.size, s->pairs);
-    add_parts(parts, n * d, s->coupled_cameras);
-    if (reduce(s))
+    if (s->reduced_for != lam) {
+        s->lam = lam;
+        s->singular = together(s, roots_part, s->options->n_passes);
+        if (!s->singular) {
+            s->failed |= together(s, schur_part, s->options->n_pairs);
+            add_pairs(s);
+        }
+    }
+    if (s->singular || whiten(s, lam) || reduce(s))
         return EG_STEP_SINGULAR;
     double sum = step_of_cameras(s);
     pass(s, couple_part);
@@ -357,7 +402,7 @@ int eg_bundle_minimize(
     const struct { double **part; ptrdiff_t size; } parts[] = {
         {&s.statuses, passes > pairs ? passes : pairs}, {&s.trial_cameras, n * c},
         {&s.trial_points, m * b}, {&s.costs, m}, {&s.D, n * d * d}, {&s.D_points, m * b * b},
-        {&s.sums, passes * n * s.route.camera_sums}, {&s.pairs, pairs * count * s.route.pair_sums.size},
+        {&s.sums, (passes > pairs ? passes : pairs) * n * s.route.camera_sums}, {&s.pairs, pairs * count * s.route.pair_sums.size},
         {&s.blocks, s.route.factored ? count * d * d : 0}, {&s.A, n * d * d},
         {&s.white, n * d * d}, {&s.S, 144 * panels->slot[panels->n]}, {&s.x, 12 * panels->n},
         {&s.step, n * d}, {&s.T, m * b * b}, {&s.half, m * b}, {&s.coupled_cameras, pairs * n * d},

@@ -100,7 +100,8 @@ EG_INLINE void eg_add_by_view(
 
 /* ---------------------------------------------------------------- the factored route */
 
-/* Pair by pair, the factors F_s F_t^T of all points at once (in work), the sums in registers. */
+/* Pair by pair, the factors F_s F_t^T of all points at once (in work), the sums in registers. F has
+   what is kept of an observation to the next slot. */
 void eg_factored_pairs_alike(const eg_pass *p, const eg_envelope *envelope, ptrdiff_t lanes,
                              const double *F, double *pairs)
 {
@@ -109,7 +110,8 @@ void eg_factored_pairs_alike(const eg_pass *p, const eg_envelope *envelope, ptrd
     double *X = p->work;
     for (ptrdiff_t t = 0; t < chunk->L; ++t)
         for (ptrdiff_t s = 0; s <= t; ++s) {
-            const double *Fs = F + 12 * s * M, *Ft = F + 12 * t * M;
+            const ptrdiff_t kept = p->route->kept * M;
+            const double *Fs = F + kept * s, *Ft = F + kept * t;
             const int32_t row = chunk->view[t * M], column = chunk->view[s * M];
             if (column < envelope->first[row])
                 continue;
@@ -166,13 +168,17 @@ void eg_factored_pairs(const eg_route *route, const eg_envelope *envelope, eg_gr
 
 /* ---------------------------------------------------------------- the direct route */
 
-/* Jacobians J (2, tangent of the model) of a slot, lane by lane: rows of the padded width of both
-   coordinates, filled up with zeros. Returns where they are, behind all else in `work`. */
-EG_INLINE double *turn_cameras(const eg_pass *p, ptrdiff_t padded, const double *J)
+/* Where `turn_cameras` keeps the Jacobians of a slot: lane by lane, rows of both coordinates. */
+EG_INLINE double *turned_cameras(const eg_pass *p)
+{
+    return p->kept + (1 + 2 * p->route->point) * p->chunk.M;
+}
+
+/* Turn Jacobians J (2, tangent of the model) of a slot; rows are filled up with zeros. */
+EG_INLINE void turn_cameras(const eg_pass *p, ptrdiff_t padded, const double *J)
 {
     const ptrdiff_t M = p->chunk.M, K = p->route->tangent, d = eg_model_of(p)->tangent_size;
     const int32_t *column = p->bundle->columns;
-    double *turned = p->work + (p->route->work - 2 * padded) * M;
     const double *row[2 * EG_MOST_TANGENT];
     memset(p->loss, 0, (size_t)M * sizeof(double)); /* not needed any more */
     for (ptrdiff_t k = 0; k < padded; ++k) {
@@ -182,20 +188,18 @@ EG_INLINE double *turn_cameras(const eg_pass *p, ptrdiff_t padded, const double 
     for (ptrdiff_t k = 0; k < 2 * padded; k += 4) {
         const double *EG_RESTRICT x = row[k], *EG_RESTRICT y = row[k + 1];
         const double *EG_RESTRICT z = row[k + 2], *EG_RESTRICT w = row[k + 3];
-        double *EG_RESTRICT to = turned + k;
+        double *EG_RESTRICT to = turned_cameras(p) + k;
         for (ptrdiff_t j = 0; j < p->filled; ++j, to += 2 * padded)
             to[0] = x[j], to[1] = y[j], to[2] = z[j], to[3] = w[j];
     }
-    return turned;
 }
 
 /* Sums of the cameras of a slot, K rows of the upper triangle of J^T J, from the multiple of four
    before the diagonal on, and one of the gradient. */
-EG_INLINE void add_to_cameras(const eg_pass *p, ptrdiff_t padded, const double *r, const double *J,
-                              double *cameras)
+EG_INLINE void add_to_cameras(const eg_pass *p, ptrdiff_t padded, const double *r, double *cameras)
 {
     const ptrdiff_t M = p->chunk.M, K = p->route->tangent;
-    const double *first = turn_cameras(p, padded, J);
+    const double *first = turned_cameras(p);
     for (ptrdiff_t j = 0; j < p->filled; ++j, first += 2 * padded) {
         const double *EG_RESTRICT x = first, *EG_RESTRICT y = first + padded;
         double *EG_RESTRICT sum = cameras + p->route->camera_sums * p->view[j];
@@ -214,12 +218,12 @@ EG_INLINE void add_to_cameras(const eg_pass *p, ptrdiff_t padded, const double *
 }
 
 /* Y = J^T Z of every observation of a slot, turned: b rows of the padded width; reduced += Y v. */
-EG_INLINE void turn_direct(const eg_pass *p, ptrdiff_t padded, ptrdiff_t b, const double *J,
-                           const double *Z, const double *v, const int32_t *begin, ptrdiff_t s,
-                           double *turned, double *reduced)
+EG_INLINE void turn_direct(const eg_pass *p, ptrdiff_t padded, ptrdiff_t b, const double *Z,
+                           const double *v, const int32_t *begin, ptrdiff_t s, double *turned,
+                           double *reduced)
 {
     const ptrdiff_t M = p->chunk.M;
-    const double *first = turn_cameras(p, padded, J);
+    const double *first = turned_cameras(p);
     for (ptrdiff_t j = 0; j < p->filled; ++j, first += 2 * padded) {
         const double *EG_RESTRICT x = first, *EG_RESTRICT y = first + padded;
         double *EG_RESTRICT Y = turned + padded * b * (begin[j] + s);
@@ -310,19 +314,22 @@ EG_INLINE void add_block(ptrdiff_t K, ptrdiff_t padded, ptrdiff_t b, ptrdiff_t r
     {                                                                                              \
         eg_add_by_view(route, envelope, group, (B) * (W), EG_RUN, sums, NULL, add_##NAME);         \
     }                                                                                              \
-    static void turn_slot_##NAME(const eg_pass *p, const double *J, const double *Z,               \
-                                 const double *v, const int32_t *first, ptrdiff_t s,               \
-                                 eg_group *group, double *reduced)                                 \
+    static void turn_slot_##NAME(const eg_pass *p, const double *Z, const double *v,               \
+                                 const int32_t *first, ptrdiff_t s, eg_group *group,               \
+                                 double *reduced)                                                  \
     {                                                                                              \
-        turn_direct(p, W, B, J, Z, v, first, s, group->turned, reduced);                           \
+        turn_direct(p, W, B, Z, v, first, s, group->turned, reduced);                              \
     }
 
 /* Those of a width, up to EG_MOST_TANGENT. */
 #define WIDTH(W)                                                                                   \
-    static void add_cameras_##W(const eg_pass *p, const double *r, const double *J,                \
-                                double *cameras)                                                   \
+    static void turn_cameras_##W(const eg_pass *p, const double *J)                                \
     {                                                                                              \
-        add_to_cameras(p, W, r, J, cameras);                                                       \
+        turn_cameras(p, W, J);                                                                     \
+    }                                                                                              \
+    static void add_cameras_##W(const eg_pass *p, const double *r, double *cameras)                \
+    {                                                                                              \
+        add_to_cameras(p, W, r, cameras);                                                          \
     }                                                                                              \
     LOOPS(three_##W, W, 3) LOOPS(four_##W, W, 4)
 
@@ -335,6 +342,7 @@ void eg_direct_loops(eg_route *route)
     switch (route->padded) {
 #define CASE(W)                                                                                    \
     case W:                                                                                        \
+        route->turn_cameras = turn_cameras_##W;                                                    \
         route->add_cameras = add_cameras_##W;                                                      \
         route->turn_slot = three ? turn_slot_three_##W : turn_slot_four_##W;                       \
         route->pairs = three ? pairs_three_##W : pairs_four_##W;                                   \

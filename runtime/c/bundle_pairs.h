@@ -15,7 +15,7 @@ void eg_factored_pairs(const eg_route *, const eg_envelope *, eg_group *, double
 void eg_factored_pairs_alike(const eg_pass *, const eg_envelope *, ptrdiff_t lanes, const double *F,
                              double *pairs);
 
-/* Fill in `add_cameras`, `turn_slot` and `pairs` of the direct route for its width. */
+/* Fill in `turn_cameras`, `add_cameras`, `turn_slot` and `pairs` of the direct route for its width. */
 void eg_direct_loops(eg_route *route);
 
 #endif

@@ -32,28 +32,65 @@ static inline void inverse_root(ptrdiff_t M, int b, const double *A, double *T)
         eg_inverse_root(M, A, T);
 }
 
+/* A = V + lam W in lanes, by trace or block. */
+static inline void damp(ptrdiff_t M, int b, int damping, const double *EG_RESTRICT V,
+                        const double *EG_RESTRICT lams, double *EG_RESTRICT A)
+{
+    for (int k = 0; k < b * (b + 1) / 2; ++k) {
+        EG_SIMD
+        for (ptrdiff_t j = 0; j < M; ++j)
+            A[k * M + j] = (damping == EG_BLOCK ? 1.0 + lams[j] : 1.0) * V[k * M + j];
+    }
+    EG_SIMD
+    for (ptrdiff_t j = 0; j < M; ++j) {
+        double trace = V[j];
+        for (int i = 1; i < b; ++i)
+            trace += V[place(b, i, i) * M + j];
+        const double shift = damping == EG_BLOCK ? 0.0 : lams[j] * (trace / b);
+        for (int i = 0; i < b; ++i)
+            A[place(b, i, i) * M + j] += shift;
+    }
+}
+
+void eg_damped_roots(ptrdiff_t M, ptrdiff_t b, int damping, const double *sums, double lam,
+                    double *EG_RESTRICT scratch, double *EG_RESTRICT T, double *EG_RESTRICT half)
+{
+    const ptrdiff_t size = b * (b + 1) / 2;
+    const double *EG_RESTRICT g = sums + (damping == EG_DEPTHS ? 2 : 1) * size * M;
+    if (damping == EG_DEPTHS) {
+        for (ptrdiff_t k = 0; k < size * M; ++k)
+            scratch[k] = sums[k] + sums[size * M + k];
+        eg_damped_inverse_root(M, sums, scratch, &lam, T);
+    } else {
+        for (ptrdiff_t j = 0; j < M; ++j)
+            half[j] = lam; /* for each lane */
+        if (b == 3)
+            damp(M, 3, damping, sums, half, scratch);
+        else
+            damp(M, 4, damping, sums, half, scratch);
+        inverse_root(M, (int)b, scratch, T);
+    }
+    for (ptrdiff_t k = 0; k < b; ++k) {
+        EG_SIMD
+        for (ptrdiff_t j = 0; j < M; ++j)
+            half[k * M + j] = T[k * M + j] * g[j];
+        for (ptrdiff_t l = 1; l < b; ++l) {
+            EG_SIMD
+            for (ptrdiff_t j = 0; j < M; ++j)
+                half[k * M + j] += T[(b * l + k) * M + j] * g[l * M + j];
+        }
+    }
+}
+
 static inline void step(ptrdiff_t M, int b, int damping, const double *EG_RESTRICT sums,
                         const double *EG_RESTRICT lams, double *EG_RESTRICT scratch,
                         double *EG_RESTRICT steps, double *EG_RESTRICT promised)
 {
     const int size = b * (b + 1) / 2;
     const double *EG_RESTRICT g = sums + size * M;
-    double *EG_RESTRICT A = scratch, *EG_RESTRICT T = A + size * M;
-    for (int k = 0; k < size; ++k) {
-        EG_SIMD
-        for (ptrdiff_t j = 0; j < M; ++j)
-            A[k * M + j] = (damping == EG_BLOCK ? 1.0 + lams[j] : 1.0) * sums[k * M + j];
-    }
-    EG_SIMD
-    for (ptrdiff_t j = 0; j < M; ++j) {
-        double trace = sums[j];
-        for (int i = 1; i < b; ++i)
-            trace += sums[place(b, i, i) * M + j];
-        const double shift = damping == EG_BLOCK ? 0.0 : lams[j] * (trace / b);
-        for (int i = 0; i < b; ++i)
-            A[place(b, i, i) * M + j] += shift;
-    }
-    inverse_root(M, b, A, T);
+    double *EG_RESTRICT T = scratch + size * M;
+    damp(M, b, damping, sums, lams, scratch);
+    inverse_root(M, b, scratch, T);
     EG_SIMD
     for (ptrdiff_t j = 0; j < M; ++j) {
         double v[4], sum = 0.0;

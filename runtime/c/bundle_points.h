@@ -13,4 +13,10 @@ void eg_moments(ptrdiff_t M, const double *points, double *moments);
 void eg_damped_point_step(ptrdiff_t M, ptrdiff_t b, int damping, const double *sums,
                           const double *lams, double *scratch, double *steps, double *promised);
 
+/* T with T T^T = (V + lam W)^-1 in lanes, and T^T g, for sums V, for EG_DEPTHS also D, and g; W is as
+   above, or V + D. Scratch has rows for an upper triangle. NaN where a matrix is not positive
+   definite. */
+void eg_damped_roots(ptrdiff_t M, ptrdiff_t b, int damping, const double *sums, double lam,
+                     double *scratch, double *T, double *half);
+
 #endif

@@ -1,4 +1,6 @@
 /* The coupling of cameras and points: Schur complement, products. */
+#include <math.h>
+
 #include "bundle_group.h"
 #include "bundle_points.h"
 
@@ -15,6 +17,43 @@ static void gather_roots(const eg_chunk *chunk, ptrdiff_t b, const double *T,
             out[k * chunk->M + j] = k % (b + 1) ? 0.0 : 1.0;
 }
 
+/* A pass that eliminates points: its group, and sums W T half in rows of the padded width. */
+typedef struct {
+    eg_pass pass;
+    eg_route route;
+    eg_group group;
+    double *reduced;
+} elimination;
+
+static void elimination_end(elimination *e, double *reduced)
+{
+    const ptrdiff_t K = e->route.tangent, wide = e->route.padded;
+    for (ptrdiff_t i = 0; reduced && i < e->pass.bundle->n_views; ++i)
+        for (ptrdiff_t k = 0; k < K; ++k)
+            reduced[K * i + k] += e->reduced[wide * i + k];
+    eg_release(e->reduced);
+    eg_release(e->group.turned);
+    eg_release(e->pass.memory);
+}
+
+/* Begin with so many doubles a lane beside roots and half; 1 where there is no memory. */
+static int elimination_begin(elimination *e, const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end,
+                             ptrdiff_t a_lane)
+{
+    e->route = eg_route_of(bundle);
+    const ptrdiff_t b = e->route.point, size = bundle->n_views * e->route.padded;
+    e->reduced = eg_aligned(size);
+    const int failed = eg_group_begin(&e->group, bundle, &e->route, begin, end)
+                       | eg_pass_begin(&e->pass, bundle, &e->route, begin, end, b + b * b + a_lane,
+                                       e->route.kept);
+    if (failed || !e->reduced) {
+        elimination_end(e, NULL);
+        return 1;
+    }
+    memset(e->reduced, 0, (size_t)size * sizeof(double));
+    return 0;
+}
+
 /* Add to the pairs of cameras what eliminating the points takes off them, W T T^T W^T; pairs outside
    the envelope are left out. Add W T half to the cameras. */
 int eg_bundle_schur(
@@ -22,37 +61,83 @@ int eg_bundle_schur(
     const double *points, const double *T, const double *half, const eg_envelope *envelope,
     double *pairs, double *reduced)
 {
-    const eg_route route = eg_route_of(bundle);
-    const ptrdiff_t b = route.point, n = bundle->n_views, K = route.tangent, wide = route.padded;
-    eg_pass p;
-    eg_group group;
-    double *own = calloc((size_t)(n * wide), sizeof *own);
-    int failed = !own || eg_group_begin(&group, bundle, &route, begin, end);
-    if (failed || eg_pass_begin(&p, bundle, &route, begin, end, b + b * b, route.factors)) {
-        if (!failed)
-            eg_release(group.turned);
-        free(own);
+    elimination e;
+    eg_pass *p = &e.pass;
+    if (elimination_begin(&e, bundle, begin, end, 0))
         return 1;
-    }
+    const ptrdiff_t b = e.route.point;
     for (ptrdiff_t c = begin, last; c < end; c = last) {
-        eg_group_clear(&group);
-        for (last = eg_group_end(bundle, c, end, route.turned); c < last; ++c) {
-            eg_pass_chunk(&p, c, points);
-            double *v = p.extra, *roots = v + b * p.chunk.M;
-            gather_roots(&p.chunk, b, T, roots);
+        eg_group_clear(&e.group);
+        last = eg_group_end(bundle, c, end, e.route.turned);
+        for (; c < last; ++c) {
+            eg_pass_chunk(p, c, points);
+            const ptrdiff_t M = p->chunk.M;
+            double *v = p->extra, *roots = v + b * M, *kept = roots + b * b * M;
+            gather_roots(&p->chunk, b, T, roots);
             if (half)
-                eg_gather(p.chunk.M, b, half, p.chunk.point, v);
-            route.turn(&p, cameras, roots, half ? v : 0, envelope, &group, pairs, own);
+                eg_gather(M, b, half, p->chunk.point, v);
+            if (e.route.factored)
+                eg_moments(M, p->points, p->moments);
+            for (ptrdiff_t s = 0; s < p->chunk.L; ++s) {
+                eg_pass_slot(p, s, cameras);
+                eg_pass_keep(p, s, kept);
+                e.route.evaluate(p);
+            }
+            e.route.turn(p, roots, half ? v : 0, kept, envelope, &e.group, pairs, e.reduced);
         }
-        route.pairs(&route, envelope, &group, pairs);
+        e.route.pairs(&e.route, envelope, &e.group, pairs);
     }
-    for (ptrdiff_t i = 0; i < n; ++i)
-        for (ptrdiff_t k = 0; k < K; ++k)
-            reduced[K * i + k] += own[wide * i + k];
-    free(own);
-    eg_release(group.turned);
-    eg_release(p.memory);
+    elimination_end(&e, reduced);
     return 0;
+}
+
+/* `eg_bundle_linearize`, `eg_bundle_inverse_roots` and `eg_bundle_schur` in one pass, with a known
+   lambda: each observation is evaluated once. Returns 2 where a block is not positive definite. */
+int eg_bundle_eliminate(
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras,
+    const double *points, double lam, int damping, const eg_envelope *envelope, double *V, double *D,
+    double *g, double *T, double *half, double *camera_sums, double *pairs, double *reduced)
+{
+    elimination e;
+    eg_pass *p = &e.pass;
+    int status = 0;
+    const ptrdiff_t most_rows = 24 + 10; /* sums and scratch of points of four entries */
+    if (elimination_begin(&e, bundle, begin, end, most_rows))
+        return 1;
+    const ptrdiff_t b = e.route.point, block = b * (b + 1) / 2;
+    for (ptrdiff_t c = begin, last; c < end; c = last) {
+        eg_group_clear(&e.group);
+        last = eg_group_end(bundle, c, end, e.route.turned);
+        for (; c < last; ++c) {
+            eg_pass_chunk(p, c, points);
+            const ptrdiff_t M = p->chunk.M, size = e.route.sums * M;
+            double *v = p->extra, *roots = v + b * M, *sums = roots + b * b * M;
+            double *scratch = sums + size, *kept = scratch + block * M;
+            memset(sums, 0, (size_t)size * sizeof(double));
+            if (e.route.factored)
+                eg_moments(M, p->points, p->moments);
+            for (ptrdiff_t s = 0; s < p->chunk.L; ++s) {
+                eg_pass_slot(p, s, cameras);
+                eg_pass_keep(p, s, kept);
+                e.route.observe(p, sums, camera_sums);
+            }
+            eg_damped_roots(M, b, e.route.factored ? EG_DEPTHS : damping, sums, lam, scratch, roots, v);
+            for (ptrdiff_t j = 0; j < M && p->chunk.count[j]; ++j)
+                for (ptrdiff_t k = 0; k < b; ++k) /* the diagonal tells */
+                    if (!isfinite(roots[(b + 1) * k * M + j]))
+                        status = 2;
+            eg_scatter_symmetric(&p->chunk, b, sums, V);
+            if (e.route.factored)
+                eg_scatter_symmetric(&p->chunk, b, sums + block * M, D);
+            eg_scatter(&p->chunk, b, sums + size - b * M, g);
+            eg_scatter(&p->chunk, b * b, roots, T);
+            eg_scatter(&p->chunk, b, v, half);
+            e.route.turn(p, roots, v, kept, envelope, &e.group, pairs, e.reduced);
+        }
+        e.route.pairs(&e.route, envelope, &e.group, pairs);
+    }
+    elimination_end(&e, reduced);
+    return status;
 }
 
 /* v = y + T^T W^T x, with y = 0 or x = 0 where NULL; moved = v and reduced += W T v unless NULL.

@@ -197,8 +197,9 @@ static double cost_at_start(void *self)
     return resection_cost(own->r, own->P, NULL);
 }
 
-static eg_lm_system linearize(void *self)
+static eg_lm_system linearize(void *self, double lam)
 {
+    (void)lam;
     static const eg_bundle one = {.n_views = 1, .model = EG_FACTORED};
     one_camera *own = self;
     double sums[EG_CAMERA], depth[144];

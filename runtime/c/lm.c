@@ -81,7 +81,8 @@ static int loop(const eg_lm_problem *problem, const eg_lm_options *options, doub
     const double begun = history ? now() : 0.0;
     outcome->cost = finite_or_infinity(problem->cost_at_start(self));
     record(history, outcome, outcome->cost, 0.0, 0.0, 1, begun);
-    eg_lm_system system = problem->linearize(self);
+    const int known = !options->relative && options->max_iter > 0;
+    eg_lm_system system = problem->linearize(self, known ? options->start : 0.0);
     outcome->njev = 1;
     if (!isfinite(outcome->cost))
         return -3;
@@ -120,12 +121,11 @@ static int loop(const eg_lm_problem *problem, const eg_lm_options *options, doub
         next.lam = fmax(next.lam, least);
         outcome->cost = trial;
         problem->accept(self);
-        system = problem->linearize(self);
+        const int status = decrease <= options->ftol * outcome->cost ? 2 : norm <= options->xtol ? 3 : 0;
+        system = problem->linearize(self, status || outcome->nit >= options->max_iter ? 0.0 : lam);
         outcome->njev += 1;
-        if (decrease <= options->ftol * outcome->cost)
-            return 2;
-        if (norm <= options->xtol)
-            return 3;
+        if (status)
+            return status;
     }
 }
 

@@ -17,12 +17,13 @@ typedef struct {
 enum { EG_STEP_MADE, EG_STEP_SINGULAR, EG_STEP_HOPELESS };
 
 /* A problem with an estimate and a trial of its own. Costs are half of what is minimised; infinity
-   rejects. */
+   rejects. `linearize` is told the lambda of the first step that follows, 0 where none does or it is
+   not known yet. */
 typedef struct {
     void *self;
     double floor; /* a cost this low is rounding error */
     double (*cost_at_start)(void *self);
-    eg_lm_system (*linearize)(void *self);
+    eg_lm_system (*linearize)(void *self, double lam);
     int (*step)(void *self, double lam, double *norm);
     double (*cost_at_trial)(void *self);
     void (*accept)(void *self);

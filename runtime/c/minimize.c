@@ -262,8 +262,9 @@ static double cost_at_start(void *self)
     return cost_of(m->matches, m->options, m->state->F);
 }
 
-static eg_lm_system linearized(void *self)
+static eg_lm_system linearized(void *self, double lam)
 {
+    (void)lam;
     minimization *m = self;
     const int p = m->chart->p;
     eg_lm_system system = {0.0, 0.0, 0.0};
