@@ -8,6 +8,10 @@
    epigauge.bundle.dampings. */
 #define SMALL 1e-12
 
+/* Homogeneous vectors whose scale has run away beyond this become unit vectors, as in
+   epigauge.bundle.problem. */
+#define LARGE 1e30
+
 typedef struct {
     const eg_bundle *bundle;
     const eg_envelope *views, *panels;
@@ -210,6 +214,23 @@ static int whiten(state *s, double lam)
     return 0;
 }
 
+static void in_range(ptrdiff_t count, ptrdiff_t size, double *vectors)
+{
+    for (ptrdiff_t i = 0; i < count; ++i, vectors += size) {
+        double most = 0.0, sum = 0.0;
+        for (ptrdiff_t k = 0; k < size; ++k)
+            most = fmax(most, fabs(vectors[k]));
+        if (!(most > LARGE || (most < 1.0 / LARGE && most > 0.0)) || isinf(most))
+            continue;
+        for (ptrdiff_t k = 0; k < size; ++k) {
+            vectors[k] /= most;
+            sum += vectors[k] * vectors[k];
+        }
+        for (ptrdiff_t k = 0; k < size; ++k)
+            vectors[k] /= sqrt(sum);
+    }
+}
+
 /* The cameras moved by their step; own tangents that are not computed with are zero. */
 static void retract(state *s)
 {
@@ -217,6 +238,8 @@ static void retract(state *s)
     if (s->route.factored) {
         for (ptrdiff_t k = 0; k < 12 * n; ++k)
             s->trial_cameras[k] = s->cameras[k] + s->step[k];
+        in_range(n, 12, s->trial_cameras);
+        in_range(s->m, 4, s->trial_points);
         return;
     }
     const eg_camera_model *model = eg_camera_models + s->bundle->model;

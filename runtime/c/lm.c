@@ -122,7 +122,7 @@ static int loop(const eg_lm_problem *problem, const eg_lm_options *options, doub
         outcome->cost = trial;
         problem->accept(self);
         const int status = decrease <= options->ftol * outcome->cost ? 2 : norm <= options->xtol ? 3 : 0;
-        system = problem->linearize(self, status || outcome->nit >= options->max_iter ? 0.0 : lam);
+        system = problem->linearize(self, status || outcome->nit >= options->max_iter ? 0.0 : next.lam);
         outcome->njev += 1;
         if (status)
             return status;

@@ -183,7 +183,7 @@ class BundleProblem:
 def _in_range(vectors: Array) -> Array:
     """Return homogeneous vectors, those whose scale has run away as unit vectors."""
     sizes = np.abs(vectors).max(axis=1, keepdims=True)
-    away = (sizes > _LARGE) | ((sizes < 1.0 / _LARGE) & (sizes > 0.0))
+    away = ((sizes > _LARGE) & (sizes < np.inf)) | ((sizes < 1.0 / _LARGE) & (sizes > 0.0))
     if not away.any():
         return vectors
     unit = vectors / np.where(away, sizes, 1.0)

@@ -305,7 +305,7 @@ def bundle_adjust(
         else:
             predicted, depths = reconstruction.project(tracks), None
         free = fixed, job.fixes_gauge or reference
-        verdict = judged_metric(tracks, depths, outcome, table, *free)
+        verdict = judged_metric(tracks, reconstruction, depths, outcome, table, *free)
     else:
         how = loss == "linear", table, workers, stays if job.fixes_gauge else None
         verdict = judged(tracks, reconstruction, rejected, *how)

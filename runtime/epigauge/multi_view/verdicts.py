@@ -21,7 +21,7 @@ from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.problem import BundleState, Estimate
 from epigauge.bundle.run import bundle_problem
 from epigauge.bundle.solve import Bordered, BundleSystem, Iterated, reduced_system
-from epigauge.cameras import camera_model
+from epigauge.cameras import AffineReconstruction, MetricReconstruction, camera_model
 from epigauge.kernels import Table
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import normalized
@@ -189,6 +189,7 @@ def _extent(xy: Array) -> float:
 
 def judged_metric(
     tracks: Tracks,
+    found: MetricReconstruction | AffineReconstruction,
     depths: Array | None,
     outcome: lm.Outcome[BundleState],
     kernels: Table,
@@ -201,9 +202,10 @@ def judged_metric(
     ----------
     tracks : Tracks
         Observations.
+    found : MetricReconstruction or AffineReconstruction
+        Cameras and points, at the minimum.
     depths : ndarray, shape (N,), or None
-        How far in front of its camera each observed point lies at the minimum; None where cameras
-        have no front.
+        How far in front of its camera each observed point lies; None where cameras have no front.
     outcome : Outcome
         How the minimisation ended.
     kernels : Table
