@@ -253,6 +253,49 @@ def test_what_is_known_is_the_datum() -> None:
         assert cov.distance(2, 5)[1] == pytest.approx(np.sqrt(apart @ spread @ apart), rel=1e-6)
 
 
+def test_what_no_datum_changes_is_propagated_alike_in_all() -> None:
+    """Ratios, angles and relative poses: as by differences, and the same in every datum."""
+    tracks, scene = metric_scene("SIMPLE_RADIAL", 2, n_points=16, n_cameras=1)
+    dense = Dense(scene, ("f", "k"))
+    J = dense.jacobian(lambda s: s.project(tracks).ravel())
+    bar = eg.Distance(2, 5, float(np.linalg.norm(scene.X[2] - scene.X[5])), 0.003)
+    row = np.zeros(dense.size)
+    row[dense.point(2)] = (scene.X[2] - scene.X[5]) / bar.length / bar.sigma
+    row[dense.point(5)] = -row[dense.point(2)]
+    datum, C = conditions(dense, "all points")
+    expected = dense.covariance(J.T @ J + np.outer(row, row), C[:, :6])
+    first = eg.covariance(tracks, scene, datum, 1.0, refine=("f", "k"), priors=[bar])
+
+    def ratio(s: eg.MetricReconstruction) -> float:
+        return float(np.linalg.norm(s.X[1] - s.X[2]) / np.linalg.norm(s.X[3] - s.X[4]))
+
+    def angle(s: eg.MetricReconstruction) -> float:
+        a, b = s.X[1] - s.X[7], s.X[2] - s.X[7]
+        return float(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b)))
+
+    def relative(s: eg.MetricReconstruction) -> Array:
+        turn = s.R[1] @ s.R[3].T @ scene.R[3] @ scene.R[1].T
+        K = 0.5 * (turn - turn.T)
+        return np.r_[K[2, 1], K[0, 2], K[1, 0], s.R[1] @ (s.centres[3] - s.centres[1])]
+
+    for name in DATUMS:
+        cov = first.in_gauge(conditions(dense, name)[0])
+        for found, function in (
+            (cov.ratio((1, 2), (3, 4)), ratio),
+            (cov.angle(1, 7, 2), angle),
+        ):
+            slope = dense.jacobian(lambda s, f=function: np.array([f(s)]))[0]
+            assert found[0] == pytest.approx(function(scene), rel=1e-12)
+            assert found[1] == pytest.approx(np.sqrt(slope @ expected @ slope), rel=1e-6)
+        R, c, block = cov.relative_pose(1, 3)
+        np.testing.assert_allclose(R, scene.R[3] @ scene.R[1].T)
+        np.testing.assert_allclose(c, relative(scene)[3:])
+        slopes = dense.jacobian(relative)
+        np.testing.assert_allclose(
+            block, slopes @ expected @ slopes.T, rtol=1e-5, atol=1e-6 * np.abs(block).max()
+        )
+
+
 def test_fixed_views_and_points_have_no_variance() -> None:
     tracks, scene = metric_scene("PINHOLE", 5, n_points=16)
     dense = Dense(scene, ())

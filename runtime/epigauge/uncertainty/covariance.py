@@ -151,8 +151,24 @@ class MetricCovariance:
         block = block + self._low(first) @ self._middle @ self._low(second).T
         return np.asarray(self._variance * first.out @ block @ second.out.T)
 
+    def joint(self, parts: Sequence[tuple[str, int]]) -> Array:
+        """Return the covariance of several parts together.
+
+        Parameters
+        ----------
+        parts : sequence of tuple of str and int
+            As in `between`.
+
+        Returns
+        -------
+        ndarray, shape (k, k)
+            Their numbers one after another; propagate it by derivatives to whatever follows from
+            them.
+        """
+        return np.block([[self.between(a, b) for b in parts] for a in parts])
+
     def distance(self, i: int, j: int) -> tuple[float, float]:
-        """Return the distance of two points and its standard deviation, the same in every datum.
+        """Return the distance of two points and its standard deviation.
 
         Parameters
         ----------
@@ -162,16 +178,93 @@ class MetricCovariance:
         Returns
         -------
         tuple of float
-            Length and standard deviation, in the unit of the scene. Where nothing holds the scale,
-            the standard deviation is that in the datum.
+            In the unit of the scene. The deviation is the same in every datum where priors hold
+            the scale; else it is that in the datum, and only ratios are free of it.
+        """
+        length, slope = self._length(i, j)
+        return length, self._sigma([("point", i), ("point", j)], slope)
+
+    def ratio(self, first: tuple[int, int], second: tuple[int, int]) -> tuple[float, float]:
+        """Return the ratio of two distances of points and its standard deviation, in any datum.
+
+        Parameters
+        ----------
+        first, second : tuple of int
+            Ends of the distances.
+
+        Returns
+        -------
+        tuple of float
+            First over second.
+        """
+        (a, over_a), (b, over_b) = self._length(*first), self._length(*second)
+        slope = np.concatenate([over_a / b, -a / b**2 * over_b])
+        return a / b, self._sigma([("point", k) for k in (*first, *second)], slope)
+
+    def angle(self, i: int, vertex: int, j: int) -> tuple[float, float]:
+        """Return the angle between two points at a third one and its deviation, in any datum.
+
+        Parameters
+        ----------
+        i, vertex, j : int
+            Points.
+
+        Returns
+        -------
+        tuple of float
+            In radians.
         """
         X = self.reconstruction.X
-        apart = X[i] - X[j]
+        sides = X[i] - X[vertex], X[j] - X[vertex]
+        units = [side / np.linalg.norm(side) for side in sides]
+        cosine = float(units[0] @ units[1])
+        angle = float(np.arctan2(np.linalg.norm(np.cross(*units)), cosine))
+        # The end of a side moves the angle by its part across the side, away from the other one.
+        slopes = []
+        for side, unit, other in zip(sides, units, units[::-1], strict=True):
+            across = cosine * unit - other
+            slopes.append(across / max(np.linalg.norm(across), 1e-300) / np.linalg.norm(side))
+        slope = np.concatenate([slopes[0], -slopes[0] - slopes[1], slopes[1]])
+        return angle, self._sigma([("point", k) for k in (i, vertex, j)], slope)
+
+    def relative_pose(self, i: int, j: int) -> tuple[Array, Array, Array]:
+        """Return view j as seen from view i, and its covariance.
+
+        Parameters
+        ----------
+        i, j : int
+            Views.
+
+        Returns
+        -------
+        R, c : ndarray, shape (3, 3), (3,)
+            R_j R_i^T, and the centre of j in the frame of i.
+        covariance : ndarray, shape (6, 6)
+            Of the small rotation of j about the axes of view i, and of c: the same in every datum,
+            but for the scale where nothing holds it.
+        """
+        both = self.joint([("camera", i), ("camera", j)])
+        scene = self.reconstruction
+        R = scene.R[i]
+        apart = scene.centres[j] - scene.centres[i]
+        slope = np.zeros((6, 12))
+        slope[:3, :3], slope[:3, 6:9] = -R, R
+        # c = R_i (C_j - C_i); the view i turns by w: c changes by -R_i (w x apart).
+        slope[3:, :3] = R @ np.cross(apart, np.eye(3)).T
+        slope[3:, 3:6], slope[3:, 9:] = -R, R
+        return scene.R[j] @ R.T, R @ apart, np.asarray(slope @ both @ slope.T)
+
+    def _length(self, i: int, j: int) -> tuple[float, Array]:
+        """Return the distance of two points, and its derivatives (6,)."""
+        a, b = self._part("i", ("point", i)).index, self._part("j", ("point", j)).index
+        apart = self.reconstruction.X[a] - self.reconstruction.X[b]
         length = float(np.linalg.norm(apart))
-        along = apart / length
-        cross = self.between(("point", i), ("point", j))
-        both = self.point(i) + self.point(j) - cross - cross.T
-        return length, float(np.sqrt(along @ both @ along))
+        if not length > 0.0:
+            raise ArgumentError("i, j", f"are at one place ({i}, {j})", "points apart")
+        return length, np.concatenate([apart, -apart]) / length
+
+    def _sigma(self, parts: Sequence[tuple[str, int]], slope: Array) -> float:
+        return float(np.sqrt(max(slope @ self.joint(parts) @ slope, 0.0)))
 
     @cached_property
     def std(self) -> Std:
