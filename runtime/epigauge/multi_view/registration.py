@@ -19,36 +19,29 @@ from epigauge.cameras import camera_model
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 from epigauge.multi_view.agreement import agreed_camera, agreed_fundamental, agreed_points
+from epigauge.multi_view.first_pair import (
+    MIN_MATCHES,
+    TooFewInCommon,
+    best_pair,
+    common_points,
+    rows_of,
+)
 from epigauge.multi_view.frame import Frame, counted
-from epigauge.multi_view.parallax import fit_homographies
 from epigauge.multi_view.resection import resect
 from epigauge.multi_view.tracks import MIN_POINTS, MIN_VIEWS, Reconstruction, Tracks
 from epigauge.scatter import spread
 from epigauge.two_view.geometry import canonical_cameras
-from epigauge.two_view.losses import EFFICIENT, Loss, median, robust_scale
+from epigauge.two_view.losses import EFFICIENT, Loss, robust_scale
 from epigauge.two_view.refine import refine_fundamental
 
-__all__ = ["TooFewInCommon", "registered"]
+__all__ = ["registered"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 
-class TooFewInCommon(ArgumentError):
-    """The tracks do not carry a camera over; factoring all views at once may do."""
-
-
-#: Pairs of views, those with most common points, that are tried as a start, and the fewest points.
-_PAIRS, _MATCHES = 40, 8
-
-#: Points of a pair that its parallax is measured by, where that is robust.
-_FEW = 300
-
 #: Known views whose matches a camera without known points is found from, at most.
 _PARTNERS = 10
-
-#: Points whose views are counted at a time.
-_CHUNK = 4096
 
 
 def registered(
@@ -81,89 +74,13 @@ def registered(
     """
     tracks = counted(tracks)
     builder = _Builder(tracks, frame.conditioned(tracks), kernels, robust)
-    builder.begin(*_best_pair(tracks, frame, robust))
+    builder.begin(*best_pair(tracks, frame, robust))
     while not builder.registered.all():
         builder.register(builder.next_view())
         # Gross errors bend what hangs on a few cameras, and at the end of a long sequence it does.
         if incremental or robust:
             builder.adjust()
     return Reconstruction(frame.cameras_out(builder.P), builder.Q)
-
-
-def _best_pair(tracks: Tracks, frame: Frame, robust: bool) -> tuple[int, int]:
-    """Choose the pair with the most points that no homography explains."""
-    common = _common_points(tracks)
-    pairs = np.argsort(-common, axis=None, kind="stable")[:_PAIRS]
-    pairs = pairs[common.ravel()[pairs] >= _MATCHES]
-    if not len(pairs):
-        what = f"have no two views with {_MATCHES} common points"
-        raise TooFewInCommon("tracks", what, "longer tracks, or method='factorization'")
-    chosen = np.stack(np.unravel_index(pairs, common.shape), axis=1)
-    rows = {view: _rows(tracks, view) for view in np.unique(chosen)}
-    both = [np.flatnonzero((rows[i] >= 0) & (rows[k] >= 0)) for i, k in chosen]
-    sizes = np.array([len(points) for points in both])
-    if robust:
-        both = [points[:: -(-len(points) // _FEW)] for points in both]
-    first = np.concatenate([[0], np.cumsum([len(points) for points in both])])
-    q = frame.conditioned(tracks).T
-    sides = (zip(side, both, strict=True) for side in chosen.T)
-    x1, x2 = (np.concatenate([q[rows[view][points]] for view, points in side]) for side in sides)
-    if robust:
-        errors = fit_homographies(x1, x2, first).distances
-        parallax = np.array([median(part) for part in np.split(errors, first[1:-1])])
-    else:
-        parallax = _homography_residuals(x1, x2, first)
-    i, k = chosen[np.argmax(sizes * parallax)]
-    return int(i), int(k)
-
-
-def _common_points(tracks: Tracks) -> Array:
-    """Return the number of points that each pair of views has in common, above the diagonal."""
-    common = np.zeros((tracks.n_views, tracks.n_views), dtype=np.float32)
-    for begin in range(0, tracks.n_points, _CHUNK):
-        some = slice(*np.searchsorted(tracks.point, [begin, begin + _CHUNK]))
-        incidence = np.zeros((min(_CHUNK, tracks.n_points), tracks.n_views), dtype=np.float32)
-        incidence[tracks.point[some] - begin, tracks.view[some]] = 1.0
-        common += incidence.T @ incidence
-    return np.triu(common, 1)
-
-
-def _rows(tracks: Tracks, view: int) -> Indices:
-    """Return the observation of each point in a view, -1 where there is none."""
-    own = np.flatnonzero(tracks.view == view)
-    rows = np.full(tracks.n_points, -1)
-    rows[tracks.point[own]] = own
-    return rows
-
-
-def _homography_residuals(x1: Array, x2: Array, first: Indices) -> Array:
-    """Return the median transfer error of the homography fitted to each group of matches (DLT).
-
-    Parameters
-    ----------
-    x1, x2 : ndarray, shape (m, 2)
-        Matches of all groups.
-    first : ndarray of int, shape (k + 1,)
-        First match of each group, and m.
-    """
-    a = np.column_stack([x1, np.ones(len(x1))])
-    # Normal equations of rows (a, 0, -b_1 a) and (0, a, -b_2 a), block by block.
-    b1, b2 = x2.T
-    square = a[:, :, None] * a[:, None, :]
-    weights = np.stack([np.ones(len(a)), b1, b2, b1**2 + b2**2], axis=1)
-    sums = np.add.reduceat(weights[:, :, None, None] * square[:, None], first[:-1])
-    plain, across1, across2, both = np.moveaxis(sums, 1, 0)
-    N = np.zeros((len(first) - 1, 9, 9))
-    N[:, :3, :3] = N[:, 3:6, 3:6] = plain
-    N[:, :3, 6:] = N[:, 6:, :3] = -across1
-    N[:, 3:6, 6:] = N[:, 6:, 3:6] = -across2
-    N[:, 6:, 6:] = both
-    H = np.linalg.eigh(N)[1][:, :, 0].reshape(-1, 3, 3)
-    h = np.einsum("mij,mj->mi", np.repeat(H, np.diff(first), axis=0), a)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        error = np.linalg.norm(h[:, :2] / h[:, 2:] - x2, axis=1)
-    error = np.nan_to_num(error, nan=0.0, posinf=0.0)
-    return np.array([median(part) for part in np.split(error, first[1:-1])])
 
 
 class _Builder:
@@ -178,7 +95,7 @@ class _Builder:
 
     def begin(self, i: int, k: int) -> None:
         """Start with two views."""
-        rows = _rows(self.tracks, i), _rows(self.tracks, k)
+        rows = rows_of(self.tracks, i), rows_of(self.tracks, k)
         F, Q, points = self._pair(i, k, np.flatnonzero((rows[0] >= 0) & (rows[1] >= 0)))
         self.P[i], self.P[k] = canonical_cameras(F)
         self.Q[points] = Q
@@ -197,7 +114,7 @@ class _Builder:
         view = int(np.argmax(counts))
         if counts[view] >= MIN_POINTS:
             return view
-        pairs = (self.common >= _MATCHES) & self.registered
+        pairs = (self.common >= MIN_MATCHES) & self.registered
         pairs[self.registered] = False
         view = int(np.argmax(np.where(pairs, self.common, 0.0).sum(axis=1) * pairs.sum(axis=1)))
         if np.count_nonzero(pairs[view]) < 2:
@@ -205,7 +122,7 @@ class _Builder:
             raise TooFewInCommon(
                 "tracks",
                 f"leave views {outside} with fewer than {MIN_POINTS} points in common with the "
-                f"others, and with {_MATCHES} matches in fewer than two of them",
+                f"others, and with {MIN_MATCHES} matches in fewer than two of them",
                 "longer or more tracks, fewer views, or method='factorization'",
             )
         return view
@@ -213,7 +130,7 @@ class _Builder:
     @cached_property
     def common(self) -> Array:
         """Return the number of points that two views have in common, (n, n)."""
-        above = _common_points(self.tracks)
+        above = common_points(self.tracks)
         return np.asarray(above + above.T)
 
     def register(self, view: int) -> None:
@@ -238,12 +155,12 @@ class _Builder:
 
         P_k^T F P_i is skew-symmetric for all of them: linear in P_k.
         """
-        others = np.flatnonzero(self.registered & (self.common[view] >= _MATCHES))
+        others = np.flatnonzero(self.registered & (self.common[view] >= MIN_MATCHES))
         others = others[np.argsort(-self.common[view, others], kind="stable")][:_PARTNERS]
         equations = []
-        own = _rows(self.tracks, view)
+        own = rows_of(self.tracks, view)
         for i in others.tolist():
-            rows = _rows(self.tracks, i)
+            rows = rows_of(self.tracks, i)
             points = np.flatnonzero((rows >= 0) & (own >= 0))
             F, _, _ = self._pair(i, view, points)
             G = F @ self.P[i]
@@ -256,7 +173,7 @@ class _Builder:
 
     def _pair(self, i: int, k: int, points: Indices) -> tuple[Array, Array, Indices]:
         """Return F from view i to view k, and the points that agree with it."""
-        x1, x2 = (self.q[:, _rows(self.tracks, view)[points]].T for view in (i, k))
+        x1, x2 = (self.q[:, rows_of(self.tracks, view)[points]].T for view in (i, k))
         try:
             F, agrees = None, np.ones(len(points), dtype=np.bool_)
             if self.robust:

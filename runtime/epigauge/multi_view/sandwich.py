@@ -19,7 +19,7 @@ from epigauge.errors import ArgumentError
 from epigauge.two_view.losses import Loss, median
 
 if TYPE_CHECKING:
-    from epigauge.multi_view.uncertainty import Inverse
+    from epigauge.multi_view.inverse import Inverse
 
 __all__ = ["Influence", "RobustFit", "Sandwich"]
 
