@@ -406,3 +406,35 @@ def test_repeated_measurements_are_pruned_when_asked(tmp_path) -> None:
     with pytest.raises(FileFormatError, match="twice"):
         eg.load_tracks(tmp_path / "t.npz")
     assert_same(eg.load_tracks(tmp_path / "t.npz", prune="first"), TRACKS)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".csv"])
+def test_names_of_views_survive(tmp_path: Path, suffix: str) -> None:
+    names = ("a, b.jpg", 'the "best".png', "room #7; left.png", "o'clock", " spaced ", "ä.jpg")
+    names = tuple(sorted(names))  # in a table names are numbered by their order
+    view, point = (index.ravel() for index in np.indices((len(names), 7)))
+    xy = np.random.default_rng(0).uniform(0.0, 100.0, (len(view), 2))
+    tracks = eg.Tracks(view, point, xy, weights=np.arange(1.0, len(view) + 1.0), names=names)
+    path = tmp_path / f"tracks{suffix}"
+    eg.save_tracks(path, tracks)
+    again = eg.load_tracks(path)
+    assert again.names == names
+    for name in ("view", "point", "xy", "weights"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(tracks, name))
+
+
+def test_a_name_of_two_lines_is_refused_by_a_table(tmp_path: Path) -> None:
+    view, point = (index.ravel() for index in np.indices((2, 7)))
+    tracks = eg.Tracks(view, point, np.zeros((14, 2)), names=("a\nb", "c"))
+    with pytest.raises(ArgumentError, match="NPZ"):
+        eg.save_tracks(tmp_path / "tracks.csv", tracks)
+    assert not (tmp_path / "tracks.csv").exists()
+
+
+def test_names_of_another_number_are_refused(tmp_path: Path) -> None:
+    view, point = (index.ravel() for index in np.indices((3, 7)))
+    arrays = {"view": view, "point": point, "xy": np.zeros((21, 2))}
+    for names in (np.array(["a", "b"]), np.array([["a", "b", "c"]]), np.arange(3)):
+        np.savez(tmp_path / "tracks.npz", names=names, **arrays)
+        with pytest.raises(FileFormatError, match="names"):
+            eg.load_tracks(tmp_path / "tracks.npz")

@@ -20,14 +20,19 @@ _MAX_VALUES = 4 * MAX_MATCHES
 _MAX_HEADER = 1000
 _DESCR = re.compile(r"'descr': *'([^']*)'")
 _NUMBERS = re.compile(r"[<>|=]?[biuf]\d{1,2}")
-#: Numbers or text.
+#: Text; numbers or text.
+_WORDS = re.compile(r"[<>|=]?U\d{1,5}")
 _PLAIN = re.compile(r"[<>|=]?(?:[biuf]\d{1,2}|U\d{1,5})")
 _ORDER = re.compile(r"'fortran_order': *(True|False)")
 _SHAPE = re.compile(r"'shape': *\(([0-9, ]{0,100})\)")
 
 
 def read_npz(
-    path: Path, file: IO[bytes], needed: Sequence[Sequence[str]], optional: Sequence[str] = ()
+    path: Path,
+    file: IO[bytes],
+    needed: Sequence[Sequence[str]],
+    optional: Sequence[str] = (),
+    words: Sequence[str] = (),
 ) -> dict[str, NDArray[Any]]:
     """Read some arrays of an NPZ file; the others are not looked at.
 
@@ -41,6 +46,8 @@ def read_npz(
         Alternatives: the first group of arrays that the file holds is read.
     optional : sequence of str
         Arrays read where the file holds them.
+    words : sequence of str
+        The same, of text.
 
     Returns
     -------
@@ -65,7 +72,11 @@ def read_npz(
                 path, f"needs arrays {alternatives}; it holds {listed(list(members))}"
             )
         wanted = [*(name for name in optional if name in members), *group]
-        return {name: _read_npy(path, archive, members[name]) for name in wanted}
+        found = {name: _read_npy(path, archive, members[name]) for name in wanted}
+        for name in words:
+            if name in members:
+                found[name] = _read_npy(path, archive, members[name], _WORDS)
+        return found
 
 
 def read_every_array(path: Path, file: IO[bytes]) -> dict[str, NDArray[Any]]:

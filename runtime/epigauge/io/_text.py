@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -135,7 +136,7 @@ def text_lines(path: Path, file: IO[bytes]) -> Iterator[tuple[int, str, str]]:
     line = 0
     while raw := file.readline(_MAX_LINE + 1):
         line += 1
-        text, _, comment = decoded(path, raw, line).partition("#")
+        text, comment = _without_comment(decoded(path, raw, line))
         yield line, text.strip(), comment.strip()
 
 
@@ -158,8 +159,35 @@ def _separator(text: str) -> str | None:
     return next((mark for mark in ";," if mark in text), None)
 
 
+def _without_comment(text: str) -> tuple[str, str]:
+    """Return a line before and after the first # that is in no quoted field."""
+    if '"' not in text:
+        before, _, after = text.partition("#")
+        return before, after
+    marks = (k for k, letter in enumerate(text) if letter == "#")
+    at = next((k for k in marks if text.count('"', 0, k) % 2 == 0), len(text))
+    return text[:at], text[at + 1 :]
+
+
+#: Field of a table with quotes: a quoted one, in which "" stands for ", or a plain one.
+_QUOTED = {
+    mark: re.compile(rf'\s*(?:"((?:[^"]|"")*)"|([^{mark}]*?))\s*({mark}|$)') for mark in ",;"
+}
+
+
 def _split(text: str, separator: str | None) -> list[str]:
     """Split a line into fields, without the blanks and quotes around them."""
+    if separator is not None and '"' in text:
+        fields, at, more = [], 0, True
+        while more:
+            found = _QUOTED[separator].match(text, at)
+            if found is None:  # text beside a quoted field
+                break
+            quoted, plain, mark = found.groups()
+            fields.append(plain.strip("'") if quoted is None else quoted.replace('""', '"'))
+            at, more = found.end(), bool(mark)
+        else:
+            return fields
     fields = [field.strip() for field in text.split(separator)]
     return [field.strip("\"'") for field in fields] if '"' in text or "'" in text else fields
 

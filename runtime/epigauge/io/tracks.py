@@ -183,6 +183,10 @@ def _names(
     """Return what the file calls the views: by name, or by numbers other than ours."""
     if "names" in found:
         given = found["names"]
+        if isinstance(given, np.ndarray):
+            if given.ndim != 1:
+                raise FileFormatError(path, f"names has shape {given.shape}; needed: one a view")
+            given = given.tolist()
         if len(given) <= old_views[-1]:
             raise FileFormatError(path, f"holds {len(given)} names, needed: one a view")
         return view_names([given[k] for k in old_views.tolist()], len(old_views))
@@ -284,9 +288,16 @@ def save_reconstruction(path: PathLike, reconstruction: Reconstruction) -> None:
 
 
 def arrays_of(tracks: Tracks) -> dict[str, Any]:
-    """Return the arrays that stand for tracks in NPZ; weights only where they are not all one."""
-    weights = {"weights": tracks.weights} if (tracks.weights != 1.0).any() else {}
-    return {"view": tracks.view, "point": tracks.point, "xy": tracks.xy, **weights}
+    """Return the arrays that stand for tracks in NPZ.
+
+    Weights only where they are not all one, names of views where there are any.
+    """
+    found: dict[str, Any] = {"view": tracks.view, "point": tracks.point, "xy": tracks.xy}
+    if (tracks.weights != 1.0).any():
+        found["weights"] = tracks.weights
+    if tracks.names is not None:
+        found["names"] = np.array(tracks.names)
+    return found
 
 
 def _form(path: PathLike) -> str:
@@ -305,7 +316,9 @@ def _read(path: Path, with_start: bool) -> dict[str, Any]:
         if form == ".npz":
             start = ("P", "Q", "X") if with_start else ()
             optional = ("weights", "clean", "n_views", "n_points", *start)
-            return dict(read_npz(path, file, [_TRACKS, ("P", "Q"), ("P", "X")], optional))
+            return dict(
+                read_npz(path, file, [_TRACKS, ("P", "Q"), ("P", "X")], optional, ["names"])
+            )
         if form == ".csv":
             columns = read_text(path, file, _COLUMNS, "clean")
             found = {"view": columns["view"], "point": columns["point"]}
@@ -398,13 +411,22 @@ def _count(path: Path, name: str, found: dict[str, Any]) -> int | None:
 
 def _write_csv(file: IO[bytes], tracks: Tracks) -> None:
     arrays = arrays_of(tracks)
-    views = tracks.view if tracks.names is None else np.array(tracks.names)[tracks.view]
+    names = None if tracks.names is None else np.array(list(map(_label, tracks.names)))
+    views = tracks.view if names is None else names[tracks.view]
     head = ["view", "point", "x", "y", *(["weight"] if "weights" in arrays else [])]
     columns = [views, tracks.point, *tracks.xy.T]
     columns += [arrays["weights"]] if "weights" in arrays else []
     file.write((",".join(head) + "\n").encode())
     for row in zip(*(column.tolist() for column in columns), strict=True):
         file.write((",".join(map(_written, row)) + "\n").encode())
+
+
+def _label(name: str) -> str:
+    """Return the name of a view as a field, quoted where it has to be."""
+    if not name.isprintable():
+        raise ArgumentError("names", f"hold {name!r:.60}", "names of one line for CSV, or NPZ")
+    special = name != name.strip() or any(mark in name for mark in ",;#\"'")
+    return '"' + name.replace('"', '""') + '"' if special else name
 
 
 def _written(value: object) -> str:
