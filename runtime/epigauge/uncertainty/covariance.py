@@ -264,7 +264,8 @@ class MetricCovariance:
         return length, np.concatenate([apart, -apart]) / length
 
     def _sigma(self, parts: Sequence[tuple[str, int]], slope: Array) -> float:
-        return float(np.sqrt(max(slope @ self.joint(parts) @ slope, 0.0)))
+        variance = float(slope @ self.joint(parts) @ slope)
+        return max(variance, 0.0) ** 0.5
 
     @cached_property
     def std(self) -> Std:
