@@ -437,11 +437,79 @@ def test_bal_problems_reach_the_optimum_in_few_steps(data_dir: Path, name: str) 
         expected,
         *(
             eg.bundle_adjust(tracks, eg.gauge.transform(start, similarity(seed, size)))
-            for seed in range(3)
+            for seed in range(20)
         ),
     ):
         near = [row.cost <= optimum * (1.0 + 1e-6) for row in result.history]
         assert near.index(True) <= enough
         assert len(result.history) == len(expected.history)
         for a, b in zip(result.history, expected.history, strict=True):
-            assert a.cost == pytest.approx(b.cost, rel=2e-9)
+            assert a.cost == pytest.approx(b.cost, rel=1e-9)
+
+
+def bal_like(seed: int) -> tuple[eg.Tracks, eg.MetricReconstruction]:
+    """Return tracks of the size of BAL's problem 21, a pixel's noise, and a start a little off.
+
+    21 cameras of BAL's kind on an arc in front of 11,315 points, 36,455 observations in runs of
+    neighbouring views.
+    """
+    n, m, N = 21, 11315, 36455
+    rng = np.random.default_rng(seed)
+    X = rng.uniform([-4.0, -2.0, -3.0], [4.0, 2.0, 3.0], (m, 3))
+    angles = np.linspace(-0.9, 0.9, n) + 0.03 * rng.standard_normal(n)
+    out = 10.0 * rng.uniform(0.8, 1.2, n)
+    centres = np.column_stack(
+        [out * np.sin(angles), rng.uniform(-0.5, 0.5, n), out * np.cos(angles)]
+    )
+    R = np.empty((n, 3, 3))
+    for i in range(n):
+        z = centres[i] - rng.uniform(-0.5, 0.5, 3)  # it looks along -z
+        z /= np.linalg.norm(z)
+        x = np.cross([0.05 * rng.standard_normal(), 1.0, 0.0], z)
+        x /= np.linalg.norm(x)
+        R[i] = [x, np.cross(z, x), z]
+    f, k1 = rng.uniform(600.0, 1200.0, n), rng.uniform(-0.08, 0.0, n)
+    params = np.column_stack([f, k1, np.zeros(n)])
+    lengths = 2 + rng.poisson(N / m - 2.0, m)
+    while lengths.sum() != N:
+        j = rng.integers(m)
+        lengths[j] = np.clip(lengths[j] + np.sign(N - lengths.sum()), 2, n)
+    first = (rng.random(m) * (n - lengths + 1)).astype(int)
+    begin = np.repeat(np.cumsum(lengths) - lengths, lengths)
+    point = np.repeat(np.arange(m), lengths)
+    view = first[point] + np.arange(N) - begin
+
+    def seen(R: Array, centres: Array, X: Array, params: Array) -> eg.MetricReconstruction:
+        t = -np.einsum("nij,nj->ni", R, centres)
+        return eg.MetricReconstruction(R, t, X, eg.Cameras("bal", params, range(n)))
+
+    blank = eg.Tracks(view, point, np.zeros((N, 2)))
+    xy = seen(R, centres, X, params).project(blank) + 0.8 * rng.standard_normal((N, 2))
+    # The nearest rotations to (I + [w]) R.
+    w = 0.005 * rng.standard_normal((n, 3))
+    U, _, Vt = np.linalg.svd(R + np.cross(w[:, None], np.swapaxes(R, 1, 2)).swapaxes(1, 2))
+    turned = U @ Vt
+    start = seen(
+        turned,
+        centres + 0.05 * rng.standard_normal((n, 3)),
+        X + 0.1 * rng.standard_normal((m, 3)),
+        params * np.column_stack([1.0 + 0.03 * rng.standard_normal(n), np.zeros((n, 2))]),
+    )
+    return eg.Tracks(blank.view, blank.point, xy), start
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_a_problem_of_the_size_of_bal_21_needs_at_most_five_steps(seed: int) -> None:
+    many_views.need_backend("c")
+    tracks, start = bal_like(seed)
+    best = eg.bundle_adjust(tracks, start, ftol=1e-12).cost
+    found = eg.bundle_adjust(tracks, start)
+    assert found.success
+    assert found.cost <= best * (1.0 + 1e-6)
+    near = [row.cost <= best * (1.0 + 1e-6) for row in found.history]
+    assert near.index(True) <= 5
+    # Noise of 0.8 px, and what the unknowns take of it.
+    unknowns = 9 * tracks.n_views + 3 * tracks.n_points - 7
+    freedom = 2 * len(tracks) - unknowns
+    assert 2.0 * found.cost / freedom == pytest.approx(0.64, rel=0.03)

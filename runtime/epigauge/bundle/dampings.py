@@ -39,6 +39,9 @@ START_METRIC = 1e-4
 #: along directions that a flat scene hardly determines: other ones in every basis.
 LAM_FLOOR = 1e-8
 
+#: The same for metric cameras: the least lambda is that of the others, over a smaller first one.
+LAM_FLOOR_METRIC = LAM_FLOOR * START / START_METRIC
+
 #: Least diagonal entry of lambda diag(N), of the mean of its block.
 _LEAST = 1e-6
 
@@ -84,15 +87,21 @@ class Marquardt(ByMatrix):
         return Blocks(_diagonals(system.U), _positive(shared), _diagonals(system.V))
 
 
+@dataclass(frozen=True)
 class Covariant(ByMatrix):
     """The damping that the gauge of the camera model leaves as it is.
 
     Homogeneous: W = blockdiag(N) + blockdiag(Z^T Z), Z = d log depth, which satisfies B03 eq. (8)
     for every T~. Metric: diag(N) of each camera, whose update is in its own frame, and the trace of
     each point's block. Affine: blockdiag(N).
+
+    Parameters
+    ----------
+    lam_floor : float
+        Least lambda over the first.
     """
 
-    lam_floor = LAM_FLOOR
+    lam_floor: float = LAM_FLOOR
 
     def start(self, system: BundleSystem) -> float:
         """Return the first lambda."""

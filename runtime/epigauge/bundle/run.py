@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge.bundle import far
 from epigauge.bundle.backends import linearizer_for
-from epigauge.bundle.dampings import DAMPINGS, ByMatrix, Covariant, Implicit
+from epigauge.bundle.dampings import (
+    DAMPINGS,
+    LAM_FLOOR_METRIC,
+    ByMatrix,
+    Covariant,
+    Implicit,
+)
 from epigauge.bundle.jobs import Job
 from epigauge.bundle.linearizer import PointRefinement
 from epigauge.bundle.moves import best_conditioned, move_into
@@ -137,6 +143,8 @@ def minimized(
         was = f"is {method!r} for {job.model.name} cameras, which have no gauge of that name"
         raise ArgumentError("method", was, "'covariant', 'levenberg', 'marquardt' or 'free'")
     act: Any = DAMPINGS[name](kernels)
+    if isinstance(act, Covariant) and job.model.metric:
+        act = Covariant(LAM_FLOOR_METRIC)
     if not isinstance(act, ByMatrix):
         # Such a step is made for all parameters, free and unconstrained.
         if strategy.reference or strategy.constrained:
