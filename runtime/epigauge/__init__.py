@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge import casadi, colmap, datasets, interop, kernels, verdicts
-    from epigauge.bundle.priors import Distance, IntrinsicPrior, PointPrior, PositionPrior
+    from epigauge.bundle.priors import (
+        Distance,
+        IntrinsicPrior,
+        PointPrior,
+        PositionPrior,
+        RotationPrior,
+    )
     from epigauge.cameras import AffineReconstruction, Cameras, MetricReconstruction
     from epigauge.errors import ArgumentError, BackendError, EpigaugeError, FileFormatError
     from epigauge.images import ImageMatches, load_image, match_images
@@ -76,6 +82,7 @@ __all__ = [
     "Reconstruction",
     "ReconstructionCovariance",
     "RobustResult",
+    "RotationPrior",
     "Tracks",
     "TwoViewScene",
     "backend",
@@ -119,7 +126,7 @@ __all__ = [
 
 #: Modules below this package, and the public names that they define.
 _WHERE = {
-    "bundle.priors": "Distance IntrinsicPrior PointPrior PositionPrior",
+    "bundle.priors": "Distance IntrinsicPrior PointPrior PositionPrior RotationPrior",
     "cameras": "AffineReconstruction Cameras MetricReconstruction",
     "errors": "ArgumentError BackendError EpigaugeError FileFormatError",
     "images": "ImageMatches load_image match_images",

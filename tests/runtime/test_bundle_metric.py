@@ -19,6 +19,7 @@ from epigauge.bundle.run import bundle_problem
 from epigauge.bundle.similarity import Similarity, normal_frame
 from epigauge.bundle.solve import Step
 from epigauge.bundle.strategies import STRATEGIES
+from epigauge.rotations import from_rodrigues, rodrigues
 from laws import central_differences, distance
 
 Array = many_views.Array
@@ -74,6 +75,8 @@ PRIORS = [
     eg.PositionPrior(3, (4.5, 0.1, -10.0), covariance=COVARIANCE),
     eg.IntrinsicPrior(0, "f", 1010.0, 5.0),
     eg.PointPrior(4, (0.1, 0.2, 0.0), covariance=COVARIANCE),
+    eg.RotationPrior(2, from_rodrigues(np.array([0.1, -0.2, 0.3])), covariance=COVARIANCE),
+    eg.RotationPrior(3, from_rodrigues(np.array([1.5, 1.2, -2.3])), sigma=(0.01, 0.02, 0.03)),
 ]
 SHARED = {"params": [[1000.0, 320.0, 240.0, -0.1]] * 2, "camera_of_view": (0, 0, 1, 1)}
 LONE = {"params": [[1000.0, 320.0, 240.0, -0.1]] * 3, "camera_of_view": (0, 0, 1, 2)}
@@ -103,14 +106,19 @@ def residuals_of(problem: BundleProblem, state: BundleState, start: Any) -> Any:
             if isinstance(prior, eg.IntrinsicPrior):
                 r.append(np.array([(moved.cameras[0, 12] - prior.value) / prior.sigma]))
                 continue
-            if isinstance(prior, eg.PositionPrior):
-                pose = moved.cameras[prior.view, :12].reshape(3, 4)
-                place = -pose[:, :3].T @ pose[:, 3]
+            if isinstance(prior, eg.PointPrior):
+                away = moved.points[prior.point] - prior.position
             else:
-                place = moved.points[prior.point]
+                pose = moved.cameras[prior.view, :12].reshape(3, 4)
+                if isinstance(prior, eg.PositionPrior):
+                    away = -pose[:, :3].T @ pose[:, 3] - prior.position
+                else:
+                    turn = rodrigues(pose[:, :3] @ np.asarray(prior.rotation).T)
+                    angle = np.linalg.norm(turn)
+                    away = 2.0 * np.sin(0.5 * angle) * turn / angle
             C = prior.covariance
             C = np.diag(np.square(prior.sigma)) if C is None else C
-            r.append(np.linalg.solve(np.linalg.cholesky(C), place - prior.position))
+            r.append(np.linalg.solve(np.linalg.cholesky(C), away))
         return np.concatenate(r)
 
     return residuals, system
@@ -147,6 +155,61 @@ def test_normal_equations_and_steps_equal_a_dense_reference(case: str, backend: 
     expected = many_views.whole_ties(system) @ (scales * dense)
     step = np.asarray(system.damped_step(blocks, lam))
     assert distance(step, expected) < 1e-8 * np.abs(expected).max()
+
+
+def test_rotations_are_drawn_to_what_is_known_of_them() -> None:
+    """With standard deviations to nothing they end there; with large ones they stay."""
+    tracks, start = scene()
+    free = eg.bundle_adjust(tracks, start, refine="pose")
+    turn = from_rodrigues(np.array([0.0, 0.0, 0.05]))
+    known = turn @ free.reconstruction.R[1]
+    for sigma, expected in ((1e-9, known), (1e6, free.reconstruction.R[1])):
+        priors = [
+            eg.RotationPrior(0, free.reconstruction.R[0], sigma=1e-9),
+            eg.RotationPrior(1, known, sigma=sigma),
+        ]
+        found = eg.bundle_adjust(tracks, free.reconstruction, refine="pose", priors=priors)
+        assert np.linalg.norm(rodrigues(found.reconstruction.R[1] @ expected.T)) < 1e-5
+    # They hold the axes: place and scale are left.
+    assert found.rank == 6 * 4 + 3 * 25 - 4
+
+
+@pytest.mark.parametrize("case", ["priors", "priors and fixed"])
+def test_noise_weighs_observations_against_priors(case: str) -> None:
+    made, options = CASES[case]
+    tracks, start = scene(**made)
+    noise = 0.4
+    found = eg.bundle_adjust(tracks, start, **options, noise_px=noise, ftol=1e-14)
+
+    def scaled(prior: Any) -> Any:
+        if prior.sigma is not None:
+            return replace(prior, sigma=np.asarray(prior.sigma) / noise)
+        return replace(prior, covariance=prior.covariance / noise**2)
+
+    options = {**options, "priors": [scaled(prior) for prior in options["priors"]]}
+    expected = eg.bundle_adjust(tracks, start, **options, ftol=1e-14)
+    assert distance(found.reconstruction.X, expected.reconstruction.X) < 1e-9
+    assert found.cost == pytest.approx(expected.cost, rel=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_noise_is_estimated_from_the_images(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true_px = 0.1
+    tracks, start = scene(m=60, seed=seed)
+    exact = eg.bundle_adjust(tracks, start).reconstruction
+    xy = exact.project(tracks) + true_px * rng.standard_normal((len(tracks), 2))
+    tracks = eg.Tracks(tracks.view, tracks.point, xy)
+    priors = [
+        eg.PositionPrior(i, exact.centres[i] + 0.01 * rng.standard_normal(3), sigma=0.01)
+        for i in range(4)
+    ]
+    found = eg.bundle_adjust(tracks, exact, priors=priors, noise_px=None)
+    assert found.noise_px == pytest.approx(true_px, rel=0.1)
+    again = eg.bundle_adjust(tracks, exact, priors=priors, noise_px=found.noise_px)
+    assert distance(again.reconstruction.X, found.reconstruction.X) < 1e-3
+    assert again.cost == pytest.approx(found.cost, rel=1e-3)
+    assert eg.bundle_adjust(tracks, exact, priors=priors).noise_px == 1.0
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if case != "all"])
@@ -248,6 +311,8 @@ class TestInvariance:
 def _moved(prior: Any, there: Similarity) -> Any:
     if isinstance(prior, eg.IntrinsicPrior):
         return prior
+    if isinstance(prior, eg.RotationPrior):  # deviations are in the camera's frame
+        return replace(prior, rotation=prior.rotation @ there.rotation.T)
     C = prior.covariance
     C = np.diag(np.square(prior.sigma)) if C is None else C
     C = there.scale**2 * there.rotation @ C @ there.rotation.T
@@ -292,6 +357,12 @@ def test_every_method_reaches_the_same_cost(method: str) -> None:
         ({"priors": [PRIORS[2]], "refine": "pose"}, "fixes"),
         ({"priors": [PRIORS[0]], "fixed_views": [1]}, "fixed"),
         ({"priors": ["GPS"]}, "str"),
+        ({"priors": [eg.RotationPrior(0, 2.0 * np.eye(3), sigma=1.0)]}, "rotation"),
+        ({"priors": [eg.RotationPrior(0, -np.eye(3), sigma=1.0)]}, "reflection"),
+        ({"priors": [eg.RotationPrior(9, np.eye(3), sigma=1.0)]}, r"priors\[0\].view"),
+        ({"priors": [PRIORS[4]], "fixed_views": [2]}, "fixed"),
+        ({"priors": [PRIORS[0]], "noise_px": -1.0}, "noise_px"),
+        ({"noise_px": 2.0}, "noise_px"),
         ({"priors": [PRIORS[0]], "method": "free"}, "method"),
         ({"fixed_views": [0], "method": "hartley"}, "method"),
         ({"method": "gauge_invariant"}, "gauge_invariant"),

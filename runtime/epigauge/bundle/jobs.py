@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.bundle.freedom import Freedom
-from epigauge.bundle.priors import Prior, Priors
+from epigauge.bundle.priors import Prior, Priors, listed_priors
 from epigauge.bundle.refinement import fixed_indices, refined_freedom, whole_freedom
 from epigauge.cameras import (
     AffineReconstruction,
@@ -80,6 +80,7 @@ def job_of(
     fixed_views: Iterable[int],
     fixed_points: Iterable[int],
     priors: Iterable[Prior] | None,
+    noise_px: float,
 ) -> Job:
     """Return the job of a start of any kind.
 
@@ -89,13 +90,27 @@ def job_of(
         On anything that is no start, sizes other than the tracks', unknown parameters, priors on
         what is fixed, or nothing left to refine.
     """
-    asked = {"fixed_views": fixed_views, "fixed_points": fixed_points}
     if isinstance(start, MetricReconstruction):
-        return metric_job(tracks, start, refine=refine, priors=priors, **asked)
+        return metric_job(
+            tracks,
+            start,
+            refine=refine,
+            fixed_views=fixed_views,
+            fixed_points=fixed_points,
+            priors=priors,
+            noise_px=noise_px,
+        )
     if not isinstance(start, Reconstruction | AffineReconstruction):
         kinds = "an eg.Reconstruction, eg.AffineReconstruction or eg.MetricReconstruction"
         raise ArgumentError("start", f"is a {type(start).__name__}", kinds)
-    return uncalibrated_job(tracks, start, refine=refine, priors=priors, **asked)
+    return uncalibrated_job(
+        tracks,
+        start,
+        refine=refine,
+        fixed_views=fixed_views,
+        fixed_points=fixed_points,
+        priors=priors,
+    )
 
 
 def uncalibrated_job(
@@ -163,6 +178,7 @@ def metric_job(
     fixed_views: Iterable[int],
     fixed_points: Iterable[int],
     priors: Iterable[Prior] | None,
+    noise_px: float = 1.0,
 ) -> Job:
     """Return the job of a metric start, in pixels.
 
@@ -175,11 +191,8 @@ def metric_job(
     _check_size(tracks, start.n_views, start.n_points, "views")
     views = fixed_indices("fixed_views", fixed_views, start.n_views)
     points = fixed_indices("fixed_points", fixed_points, start.n_points)
-    try:
-        listed = list(priors or ())
-    except TypeError:
-        raise ArgumentError("priors", f"is {priors!r:.60}", "a list of priors") from None
-    known = Priors.of(listed, start).weighted(tracks.unit**2)
+    listed = listed_priors(priors or ())
+    known = Priors.of(listed, start).weighted(noise_px**2)
 
     def result(cameras: Array, X: Array) -> MetricReconstruction:
         # What was fixed comes back as it was, to the last bit.

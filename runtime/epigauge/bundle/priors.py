@@ -1,8 +1,8 @@
-"""Gaussian priors on positions, intrinsics, points and distances: what is known beside the images.
+"""Gaussian priors on positions, rotations, intrinsics, points and distances.
 
 Each adds 0.5 e^T covariance^-1 e to the cost, e the deviation from what is known. Observations
-count with the `sigma` of the tracks; without one, as if measured with one pixel (and weight one):
-give priors a `sigma` divided by the noise of the image, in pixels, where that is not one.
+count with the `noise_px` of `bundle_adjust`: by default the `sigma` of the tracks or, without one,
+as if measured with one pixel (and weight one).
 """
 
 from __future__ import annotations
@@ -20,8 +20,18 @@ from epigauge.bundle.similarity import Similarity
 from epigauge.bundle.solve import Border
 from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
+from epigauge.rotations import as_rotation, quaternion
 
-__all__ = ["Distance", "IntrinsicPrior", "PointPrior", "PositionPrior", "Prior", "Priors"]
+__all__ = [
+    "Distance",
+    "IntrinsicPrior",
+    "PointPrior",
+    "PositionPrior",
+    "Prior",
+    "Priors",
+    "RotationPrior",
+    "listed_priors",
+]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -54,6 +64,39 @@ class PositionPrior:
 
     view: int
     position: ArrayLike
+    sigma: ArrayLike | None = None
+    covariance: ArrayLike | None = None
+
+
+@dataclass(frozen=True)
+class RotationPrior:
+    """The rotation of a view is known, as from an inertial sensor.
+
+    Parameters
+    ----------
+    view : int
+        Which.
+    rotation : array_like, shape (3, 3)
+        R of ``x_cam = R X + t``, in the frame of the start.
+    sigma : float or array_like, shape (3,), optional
+        Standard deviations of the turns about the camera's own axes, in radians.
+    covariance : array_like, shape (3, 3), optional
+        In place of `sigma`.
+
+    Notes
+    -----
+    The deviation is 2 sin(angle / 2) axis, of the turn in the camera's frame from the known
+    rotation to the camera's: the rotation vector, to third order in the angle.
+
+    Examples
+    --------
+    >>> import numpy as np, epigauge as eg
+    >>> eg.RotationPrior(2, np.eye(3), sigma=np.radians(0.5)).view
+    2
+    """
+
+    view: int
+    rotation: ArrayLike
     sigma: ArrayLike | None = None
     covariance: ArrayLike | None = None
 
@@ -124,7 +167,15 @@ class Distance:
     sigma: float
 
 
-Prior = PositionPrior | IntrinsicPrior | PointPrior | Distance
+Prior = PositionPrior | RotationPrior | IntrinsicPrior | PointPrior | Distance
+
+
+def listed_priors(priors: Any) -> tuple[Prior, ...]:
+    """Return priors given in any iterable."""
+    try:
+        return tuple(priors)
+    except TypeError:
+        raise ArgumentError("priors", f"is {priors!r:.60}", "a list of priors") from None
 
 
 @dataclass(frozen=True)
@@ -135,6 +186,8 @@ class Priors:
     ----------
     views, positions, view_information : ndarray, shape (k,), (k, 3), (k, 3, 3)
         Known centres with their inverse covariance.
+    turned, rotations, turn_information : ndarray, shape (i,), (i, 3, 3), (i, 3, 3)
+        Views with known rotations.
     points, places, point_information : ndarray, shape (l,), (l, 3), (l, 3, 3)
         Known points.
     cameras : ndarray of int, shape (j,)
@@ -151,6 +204,9 @@ class Priors:
     views: Indices
     positions: Array
     view_information: Array
+    turned: Indices
+    rotations: Array
+    turn_information: Array
     points: Indices
     places: Array
     point_information: Array
@@ -173,17 +229,25 @@ class Priors:
             number.
         """
         names = camera_model(start.cameras.model).adjusted
-        places: dict[type, list[tuple[int, Array, Array]]] = {PositionPrior: [], PointPrior: []}
+        places: dict[type, list[tuple[int, Array, Array]]] = {
+            kind: [] for kind in (PositionPrior, RotationPrior, PointPrior)
+        }
         intrinsics: list[tuple[int, int, float, float]] = []
         distances: list[tuple[int, int, float, float]] = []
         for number, prior in enumerate(priors):
             what = f"priors[{number}]"
             if isinstance(prior, PositionPrior):
                 view = _index(f"{what}.view", prior.view, start.n_views)
-                places[PositionPrior].append((view, *_gaussian(what, prior)))
+                position = _position(f"{what}.position", prior.position)
+                places[PositionPrior].append((view, position, _information(what, prior)))
+            elif isinstance(prior, RotationPrior):
+                view = _index(f"{what}.view", prior.view, start.n_views)
+                rotation = as_rotation(f"{what}.rotation", prior.rotation)
+                places[RotationPrior].append((view, rotation, _information(what, prior)))
             elif isinstance(prior, PointPrior):
                 point = _index(f"{what}.point", prior.point, start.n_points)
-                places[PointPrior].append((point, *_gaussian(what, prior)))
+                position = _position(f"{what}.position", prior.position)
+                places[PointPrior].append((point, position, _information(what, prior)))
             elif isinstance(prior, IntrinsicPrior):
                 camera = _index(f"{what}.camera", prior.camera, len(start.cameras))
                 if prior.name not in names:
@@ -202,30 +266,35 @@ class Priors:
                 sigma = _positive(f"{what}.sigma", prior.sigma)
                 distances.append((first, second, length, sigma**-2))
             else:
-                kinds = "eg.PositionPrior, eg.IntrinsicPrior, eg.PointPrior or eg.Distance"
-                raise ArgumentError(what, f"is a {type(prior).__name__}", kinds)
+                known = "eg.PositionPrior, RotationPrior, IntrinsicPrior, PointPrior or Distance"
+                raise ArgumentError(what, f"is a {type(prior).__name__}", known)
         j = np.array([row[:2] for row in intrinsics], np.intp).reshape(-1, 2)
         v = np.array([row[2:] for row in intrinsics]).reshape(-1, 2)
-        views, points = _stacked(places[PositionPrior]), _stacked(places[PointPrior])
+        views = _stacked(places[PositionPrior], (3,))
+        turns = _stacked(places[RotationPrior], (3, 3))
+        points = _stacked(places[PointPrior], (3,))
         ends = np.array([row[:2] for row in distances], np.intp).reshape(-1, 2)
         of_ends = np.array([row[2:] for row in distances]).reshape(-1, 2)
         at, numbers = (j[:, 0], j[:, 1]), (v[:, 0], v[:, 1])
-        return Priors(*views, *points, *at, *numbers, ends, of_ends[:, 0], of_ends[:, 1])
+        lengths = of_ends[:, 0], of_ends[:, 1]
+        return Priors(*views, *turns, *points, *at, *numbers, ends, *lengths)
 
     def __len__(self) -> int:
         """Return how many there are."""
-        return len(self.views) + len(self.points) + len(self.cameras) + len(self.ends)
+        return sum(map(len, (self.views, self.turned, self.points, self.cameras, self.ends)))
 
     @property
     def n_numbers(self) -> int:
         """Return how many numbers are known."""
-        return 3 * (len(self.views) + len(self.points)) + len(self.cameras) + len(self.ends)
+        vectors = len(self.views) + len(self.turned) + len(self.points)
+        return 3 * vectors + len(self.cameras) + len(self.ends)
 
     def weighted(self, weight: float) -> Priors:
         """Return the same where observations of weight one have the variance `weight`."""
         return replace(
             self,
             view_information=weight * self.view_information,
+            turn_information=weight * self.turn_information,
             point_information=weight * self.point_information,
             precisions=weight * self.precisions,
             length_precisions=weight * self.length_precisions,
@@ -236,6 +305,7 @@ class Priors:
         return replace(
             self,
             positions=there.positions(self.positions),
+            rotations=self.rotations @ there.rotation.T,
             places=there.positions(self.places),
             view_information=there.information(self.view_information),
             point_information=there.information(self.point_information),
@@ -247,6 +317,8 @@ class Priors:
         """Return what they add to the cost."""
         c, x, k = self._deviations(cameras, points)
         total = np.einsum("ki,kij,kj->", c, self.view_information, c)
+        w = self._turns(cameras)[0]
+        total = total + np.einsum("ki,kij,kj->", w, self.turn_information, w)
         total = total + np.einsum("ki,kij,kj->", x, self.point_information, x)
         away = self._along(points)[1] - self.lengths
         total = total + np.sum(self.length_precisions * away**2)
@@ -264,6 +336,10 @@ class Priors:
         moved = R @ self.view_information
         np.add.at(U[:, 3:6, 3:6], self.views, moved @ np.swapaxes(R, 1, 2))
         np.add.at(g_cameras[:, 3:6], self.views, np.einsum("kij,kj->ki", moved, c))
+        w, slope = self._turns(cameras)
+        turned = np.swapaxes(slope, 1, 2) @ self.turn_information
+        np.add.at(U[:, :3, :3], self.turned, turned @ slope)
+        np.add.at(g_cameras[:, :3], self.turned, np.einsum("kij,kj->ki", turned, w))
         np.add.at(U, (self.cameras, 6 + self.params, 6 + self.params), self.precisions)
         np.add.at(g_cameras, (self.cameras, 6 + self.params), self.precisions * k)
         np.add.at(V, self.points, self.point_information)
@@ -303,7 +379,9 @@ class Priors:
         R = cameras[self.views, :12].reshape(-1, 3, 4)[:, :, :3]
         centres = np.swapaxes(R, 1, 2) @ of_cameras[self.views, 3:6]
         g = of_points.shape[2]
-        blocks = [centres.reshape(-1, g), of_points[self.points].reshape(-1, g)]
+        turns = self._turns(cameras)[1] @ of_cameras[self.turned, :3]
+        blocks = [centres.reshape(-1, g), turns.reshape(-1, g)]
+        blocks.append(of_points[self.points].reshape(-1, g))
         blocks.append(of_cameras[self.cameras, 6 + self.params])
         apart = of_points[self.ends[:, 0]] - of_points[self.ends[:, 1]]
         blocks.append(np.einsum("ki,kig->kg", self._along(points)[0], apart))
@@ -315,6 +393,19 @@ class Priors:
         lengths = np.linalg.norm(apart, axis=1)
         return apart / np.maximum(lengths, 1e-300)[:, None], lengths
 
+    def _turns(self, cameras: Array) -> tuple[Array, Array]:
+        """Return deviations of rotations (i, 3), and their derivatives by own turns (i, 3, 3).
+
+        Of the quaternion (s, v) of R R_known^T the deviation is 2 v; turned by w, which is the
+        quaternion (1, w / 2) to first order, it becomes 2 v + s w + w x v.
+        """
+        R = cameras[self.turned, :12].reshape(-1, 3, 4)[:, :, :3]
+        q = quaternion(R @ np.swapaxes(self.rotations, 1, 2))
+        q = np.where(q[:, :1] < 0.0, -q, q)
+        s, v = q[:, 0], q[:, 1:]
+        slope = s[:, None, None] * np.eye(3) + np.cross(v[:, None], np.eye(3))
+        return 2.0 * v, np.asarray(slope)
+
     def _deviations(self, cameras: Array, points: Array) -> tuple[Array, Array, Array]:
         pose = cameras[self.views, :12].reshape(-1, 3, 4)
         centres = -np.einsum("kji,kj->ki", pose[:, :, :3], pose[:, :, 3])
@@ -322,10 +413,12 @@ class Priors:
         return centres - self.positions, points[self.points] - self.places, known - self.values
 
 
-def _stacked(rows: list[tuple[int, Array, Array]]) -> tuple[Indices, Array, Array]:
+def _stacked(
+    rows: list[tuple[int, Array, Array]], shape: tuple[int, ...]
+) -> tuple[Indices, Array, Array]:
     return (
         np.array([row[0] for row in rows], np.intp),
-        np.array([row[1] for row in rows]).reshape(-1, 3),
+        np.array([row[1] for row in rows]).reshape(-1, *shape),
         np.array([row[2] for row in rows]).reshape(-1, 3, 3),
     )
 
@@ -352,13 +445,15 @@ def _positive(name: str, value: Any) -> float:
     return number
 
 
-def _gaussian(what: str, prior: PositionPrior | PointPrior) -> tuple[Array, Array]:
-    """Return position (3,) and inverse covariance (3, 3)."""
-    position = as_real(f"{what}.position", prior.position, "three numbers")
+def _position(name: str, value: ArrayLike) -> Array:
+    position = as_real(name, value, "three numbers")
     if position.shape != (3,) or not np.isfinite(position).all():
-        raise ArgumentError(
-            f"{what}.position", f"is {prior.position!r:.60}", "three finite numbers"
-        )
+        raise ArgumentError(name, f"is {value!r:.60}", "three finite numbers")
+    return position
+
+
+def _information(what: str, prior: PositionPrior | RotationPrior | PointPrior) -> Array:
+    """Return the inverse covariance, (3, 3)."""
     if (prior.sigma is None) == (prior.covariance is None):
         given = "neither" if prior.sigma is None else "both"
         raise ArgumentError(what, f"has {given} of sigma and covariance", "one of them")
@@ -368,7 +463,7 @@ def _gaussian(what: str, prior: PositionPrior | PointPrior) -> tuple[Array, Arra
             raise ArgumentError(
                 f"{what}.sigma", f"is {prior.sigma!r:.60}", "positive, one or three"
             )
-        return position, np.diag(np.broadcast_to(sigma, 3) ** -2.0)
+        return np.diag(np.broadcast_to(sigma, 3) ** -2.0)
     name = f"{what}.covariance"
     assert prior.covariance is not None
     covariance = as_real(name, prior.covariance, "a (3, 3) matrix")
@@ -378,4 +473,4 @@ def _gaussian(what: str, prior: PositionPrior | PointPrior) -> tuple[Array, Arra
     unit = covariance / np.outer(size, size) if (size > 0.0).all() else np.zeros((3, 3))
     if np.linalg.eigvalsh(unit)[0] <= _CONDITION or not np.allclose(unit, unit.T, atol=1e-9):
         raise ArgumentError(name, "is not symmetric and positive definite", "a covariance")
-    return position, np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)))
+    return np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)))

@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.bundle.freedom import Freedom
-from epigauge.bundle.priors import Distance, IntrinsicPrior, PointPrior, PositionPrior, Prior
+from epigauge.bundle.priors import (
+    Distance,
+    IntrinsicPrior,
+    PointPrior,
+    PositionPrior,
+    Prior,
+    RotationPrior,
+)
 from epigauge.bundle.ties import Ties
 from epigauge.cameras import CameraModel, Cameras, MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
@@ -180,7 +187,7 @@ def _check_priors(
         free |= direction.any(axis=0)
     for number, prior in enumerate(priors):
         what, remedy = f"priors[{number}]", "a prior on what is refined, or nothing fixed there"
-        if isinstance(prior, PositionPrior) and prior.view in fixed_views:
+        if isinstance(prior, PositionPrior | RotationPrior) and prior.view in fixed_views:
             raise ArgumentError(what, f"is on view {prior.view}, which is fixed", remedy)
         if isinstance(prior, PointPrior) and prior.point in fixed_points:
             raise ArgumentError(what, f"is on point {prior.point}, which is fixed", remedy)

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from epigauge.errors import ArgumentError
 from epigauge.io._common import PathLike
-from epigauge.io._rotations import quaternion
 from epigauge.io.output import writing
 from epigauge.multi_view.tracks import Tracks
+from epigauge.rotations import quaternion
 
 if TYPE_CHECKING:
     from epigauge.multi_view.pinhole import PinholeModel

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._colmap_parts import CAMERA, ColmapModel, FrameRow, ImageRow, Place, RigRow
-from epigauge.io._rotations import product, quaternion, rotation
 from epigauge.io._scene import ColmapSource
+from epigauge.rotations import product, quaternion, rotation
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]

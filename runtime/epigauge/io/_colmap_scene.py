@@ -25,9 +25,9 @@ from epigauge.io._colmap_parts import (
     PointTable,
 )
 from epigauge.io._colmap_rigs import image_poses, rigs_and_frames
-from epigauge.io._rotations import quaternion, rotation
 from epigauge.io._scene import ColmapSource, RawScene, SceneSource
 from epigauge.multi_view.tracks import Tracks
+from epigauge.rotations import quaternion, rotation
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

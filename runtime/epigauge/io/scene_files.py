@@ -18,11 +18,11 @@ from epigauge.io._colmap_scene import model_of, raw_scene
 from epigauge.io._colmap_text import read_text_model, write_text_model
 from epigauge.io._common import PathLike
 from epigauge.io._npz_scene import is_npz_scene, read_npz_scene, write_npz_scene
-from epigauge.io._rotations import from_rodrigues, rodrigues
 from epigauge.io._scene import RawScene, SceneSource, finished
 from epigauge.io.output import writing
 from epigauge.io.tracks import compressing, decompressing
 from epigauge.multi_view.tracks import Tracks
+from epigauge.rotations import from_rodrigues, rodrigues
 
 __all__ = ["load_scene", "save_scene"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -15,13 +15,15 @@ from epigauge._arguments import as_choice, as_count, as_positive
 from epigauge.bundle.dampings import DAMPINGS
 from epigauge.bundle.jobs import AnyReconstruction, job_of
 from epigauge.bundle.observations import ObservationGraph
-from epigauge.bundle.priors import Prior
+from epigauge.bundle.priors import Prior, listed_priors
 from epigauge.bundle.refinement import fixed_indices
 from epigauge.bundle.run import checked_gauge, minimized
 from epigauge.bundle.strategies import STRATEGIES
 from epigauge.cameras import AffineReconstruction, MetricReconstruction
+from epigauge.errors import ArgumentError
 from epigauge.multi_view.gauge import Gauge
 from epigauge.multi_view.initialize import initialize
+from epigauge.multi_view.prior_noise import with_estimated_noise
 from epigauge.multi_view.rejection import without_gross_errors
 from epigauge.multi_view.repeated import merging_sightings
 from epigauge.multi_view.tracks import Tracks
@@ -59,6 +61,8 @@ class BundleResult:
         Name of the strategy.
     loss_scale_px : float
         Scale of the robust loss; 0 for the linear loss.
+    noise_px : float
+        Noise of the image that priors were weighed with, given or estimated.
     flags : tuple of str
         What can be said against it, from `epigauge.verdicts.FLAGS`; `success` is False with one
         that spoils a reconstruction.
@@ -87,6 +91,7 @@ class BundleResult:
     fun: Array = field(repr=False)
     method: str
     loss_scale_px: float
+    noise_px: float
     flags: tuple[str, ...]
     rank: int
     n_behind: int
@@ -111,6 +116,7 @@ def bundle_adjust(
     fixed_views: Iterable[int] = (),
     fixed_points: Iterable[int] = (),
     priors: Iterable[Prior] | None = None,
+    noise_px: float | str | None = "tracks",
     method: str = "covariant",
     gauge: Gauge | type[Gauge] | None = None,
     gauge_mode: str = "explicit",
@@ -150,7 +156,11 @@ def bundle_adjust(
         "covariant", without a gauge.
     priors : iterable, optional
         What is known of a metric reconstruction beside the images: `PositionPrior`,
-        `IntrinsicPrior` and `PointPrior`, in the frame of the start.
+        `RotationPrior`, `IntrinsicPrior` and `PointPrior`, in the frame of the start.
+    noise_px : float, "tracks" or None
+        With priors: standard deviation of an image coordinate of weight one, in pixels, which says
+        how much observations count against them. By default what the `sigma` of the tracks says, or
+        one pixel. None estimates it from the residuals, adjusting again until it stays the same.
     method : str
         Strategy: "covariant" (default) gives the same iterations in every basis; "free",
         "hartley", "bartoli", "faugeras", "mclauchlan", "kanatani" and "gauge_invariant" are those
@@ -227,12 +237,18 @@ def bundle_adjust(
     >>> tracks, scene = eg.load_scene("sparse/0")  # doctest: +SKIP
     >>> eg.bundle_adjust(tracks, scene, refine=("f", "k"), fixed_views=[0])  # doctest: +SKIP
     """
-    if robust:
+    fixed_views, fixed_points = tuple(fixed_views), tuple(fixed_points)
+    priors = None if priors is None else listed_priors(priors)
+    if noise_px != "tracks" and not priors:
+        raise ArgumentError("noise_px", "is given without priors", "priors, or the default")
+    noise_px = tracks.unit if noise_px == "tracks" else noise_px
+    noise_px = noise_px if noise_px is None else as_positive("noise_px", noise_px)
+    if robust or noise_px is None:
         options: dict[str, Any] = {
             "refine": refine,
-            "fixed_views": tuple(fixed_views),
-            "fixed_points": tuple(fixed_points),
-            "priors": None if priors is None else tuple(priors),
+            "fixed_views": fixed_views,
+            "fixed_points": fixed_points,
+            "priors": priors,
             "method": method,
             "gauge": gauge,
             "gauge_mode": gauge_mode,
@@ -247,6 +263,15 @@ def bundle_adjust(
             "backend": backend,
             "callback": callback,
         }
+        if noise_px is None:
+            options.update(robust=robust, loss=loss, loss_scale_px=loss_scale_px)
+
+            def adjusted(noise_px: float, start: Any) -> BundleResult:
+                return bundle_adjust(tracks, start, noise_px=noise_px, **options)
+
+            return with_estimated_noise(adjusted, tracks, start)
+        if priors:
+            options["noise_px"] = noise_px
         table = kernels.table(backend)
         start = initialize(tracks, robust=True, backend=backend) if start is None else start
         last = as_choice("loss", loss, LOSSES), loss_scale_px
@@ -261,7 +286,6 @@ def bundle_adjust(
     workers = as_count("workers", workers)
     stopping = lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter)
     table = kernels.table(backend)
-    fixed_views, fixed_points = tuple(fixed_views), tuple(fixed_points)
     start = initialize(tracks, backend=backend) if start is None else start
     job = job_of(
         tracks,
@@ -270,6 +294,7 @@ def bundle_adjust(
         fixed_views=fixed_views,
         fixed_points=fixed_points,
         priors=priors,
+        noise_px=noise_px,
     )
     by_default = "classic" if job.model.homogeneous else "adaptive"
     rule = by_default if schedule == "auto" else schedule
@@ -312,7 +337,7 @@ def bundle_adjust(
         predicted = reconstruction.project(tracks)
     unit, residuals = job.scale_px**2, tracks.xy - predicted
     parts = outcome, unit, verdict, rejected, method, scale_px
-    return _result(tracks, reconstruction, residuals, *parts)
+    return replace(_result(tracks, reconstruction, residuals, *parts), noise_px=noise_px)
 
 
 def _result(
@@ -334,6 +359,7 @@ def _result(
         fun=residuals,
         method=method,
         loss_scale_px=scale_px,
+        noise_px=tracks.unit,
         flags=verdict.flags,
         rank=verdict.rank,
         n_behind=verdict.n_behind,

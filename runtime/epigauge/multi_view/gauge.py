@@ -21,6 +21,7 @@ from epigauge.bundle.similarity import Similarity
 from epigauge.cameras import AffineReconstruction, MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.tracks import Reconstruction
+from epigauge.rotations import as_rotation
 from epigauge.scatter import spreading_basis
 
 __all__ = [
@@ -243,12 +244,7 @@ def similarity(s: float, R: ArrayLike, t: ArrayLike) -> Similarity:
     scale = as_real("s", s, "a positive number")
     if scale.ndim or not 0.0 < scale < np.inf:
         raise ArgumentError("s", f"is {s!r:.60}", "a positive number")
-    rotation = as_real("R", R, "a (3, 3) rotation")
-    known = rotation.shape == (3, 3) and np.isfinite(rotation).all()
-    if not known or np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-8:
-        raise ArgumentError("R", "is no rotation", "R with R^T R = I")
-    if np.linalg.det(rotation) < 0.0:
-        raise ArgumentError("R", "is a reflection (determinant -1)", "a rotation")
+    rotation = as_rotation("R", R)
     target = as_real("t", t, "three numbers")
     if target.shape != (3,) or not np.isfinite(target).all():
         raise ArgumentError("t", f"is {t!r:.60}", "three finite numbers")

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from epigauge.cameras import Cameras, MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.io import load_scene
-from epigauge.io._rotations import from_rodrigues
 from epigauge.multi_view.adjust import BundleResult, bundle_adjust
 from epigauge.multi_view.tracks import Tracks
 from epigauge.reproduce.common import Track, tracked
 from epigauge.reproduce.report import Claim, Section, Table, fewest
 from epigauge.reproduce.run import Paper
+from epigauge.rotations import from_rodrigues
 from epigauge.scenes import multi_view_scene
 
 __all__ = ["EXPERIMENTS", "LABELS", "PAPER", "MetricGaugeStudy", "moved", "random_similarity"]

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from epigauge.bundle.priors import Distance
 from epigauge.cameras import Cameras, MetricReconstruction, camera_model
-from epigauge.io._rotations import from_rodrigues
 from epigauge.multi_view.adjust import bundle_adjust
 from epigauge.multi_view.gauge import five_points, similarity, transform, two_cameras
 from epigauge.multi_view.tracks import Tracks
@@ -20,6 +19,7 @@ from epigauge.multi_view.uncertainty import covariance
 from epigauge.reproduce.common import Track, tracked
 from epigauge.reproduce.report import Claim, Section, Table
 from epigauge.reproduce.run import Paper
+from epigauge.rotations import from_rodrigues
 
 __all__ = ["EXPERIMENTS", "PAPER", "MetrologyStudy", "load_network"]
 

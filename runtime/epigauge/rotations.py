@@ -1,11 +1,28 @@
-"""Rotations in the forms that files hold: quaternions, scalar first, and Rodrigues vectors."""
+"""Rotations as matrices, quaternions (scalar first) and Rodrigues vectors."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge._arguments import as_real
+from epigauge.errors import ArgumentError
 
 Array = NDArray[np.float64]
+
+#: How far R^T R may be from the identity.
+_ORTHONORMAL = 1e-8
+
+
+def as_rotation(name: str, value: ArrayLike) -> Array:
+    """Return a rotation (3, 3) given as an argument."""
+    matrix = as_real(name, value, "a (3, 3) rotation")
+    known = matrix.shape == (3, 3) and np.isfinite(matrix).all()
+    if not known or np.abs(matrix.T @ matrix - np.eye(3)).max() > _ORTHONORMAL:
+        raise ArgumentError(name, "is no rotation", "R with R^T R = I")
+    if np.linalg.det(matrix) < 0.0:
+        raise ArgumentError(name, "is a reflection (determinant -1)", "a rotation")
+    return matrix
 
 
 def quaternion(R: Array) -> Array:
