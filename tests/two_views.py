@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+_FOCAL = 1000.0
+_CENTRE = np.array([512.0, 384.0])
+
 
 def homogeneous(x: Array) -> Array:
     """Append a column of ones."""
@@ -70,3 +73,24 @@ def published_rms(readme: Path) -> dict[str, float]:
     ]
     (column,) = (k for k, title in enumerate(rows[0]) if "RMS per coordinate" in title)
     return {row[0]: float(row[column]) for row in rows[2:]}
+
+
+def turned(rng: np.random.Generator) -> Array:
+    """A rotation by 3 to 17 degrees about a random axis."""
+    axis = rng.standard_normal(3)
+    angle = rng.uniform(0.05, 0.3)
+    C = np.cross(np.eye(3), -axis / np.linalg.norm(axis))
+    return np.asarray(np.eye(3) + np.sin(angle) * C + (1 - np.cos(angle)) * C @ C)
+
+
+def scene(kind: str, m: int, noise: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Matches of one camera in two positions: "general", "planar" or "rotation"."""
+    rays = np.column_stack([rng.uniform(-0.4, 0.4, m), rng.uniform(-0.3, 0.3, m), np.ones(m)])
+    X = rays * rng.uniform(4, 8, m)[:, None]
+    if kind == "planar":
+        X = 6 * rays / (rays @ [*rng.uniform(-0.5, 0.5, 2), 1.0])[:, None]
+    t = rng.standard_normal(3)
+    t *= 0.0 if kind == "rotation" else 0.8 / np.linalg.norm(t)
+    views = (X, X @ turned(rng).T + t)
+    x1, x2 = (_FOCAL * Y[:, :2] / Y[:, 2:] + _CENTRE for Y in views)
+    return x1 + noise * rng.standard_normal((m, 2)), x2 + noise * rng.standard_normal((m, 2))

@@ -7,7 +7,7 @@
 
 const char *eg_digest(void)
 {
-    return "7af35f170115f5ea";
+    return "dc1deb73105cf10d";
 }
 
 const char *eg_sources(void)

@@ -964,6 +964,30 @@ EG_EXPORT void eg_implicit_damping(
     double *EG_RESTRICT camera,
     double *EG_RESTRICT point);
 
+EG_EXPORT void eg_homography_squared(
+    ptrdiff_t n,
+    const double *EG_RESTRICT H,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    double *EG_RESTRICT squared);
+
+EG_EXPORT void eg_homography_normal(
+    ptrdiff_t n,
+    const double *EG_RESTRICT H,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_plane_parallax(
+    ptrdiff_t n,
+    const double *EG_RESTRICT F,
+    const double *EG_RESTRICT e2,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    double *EG_RESTRICT kappa,
+    double *EG_RESTRICT gain);
+
 EG_EXPORT void eg_canonic_squared(
     ptrdiff_t n,
     const double *EG_RESTRICT P2,

@@ -845,6 +845,24 @@ SIGNATURES = {
         (Argument("camera", (12, 12), True), Argument("point", (4, 4), True), ),
         "W' = T~^-T T~^-1 for a camera and a point, the damping that acts in the gauge T leads to as the identity in the one it comes from (B03 eqs. 8, 9; by them gamma^-2 A^-1 and alpha^-2 A, A = T^T T); `inverse` is T^-1.",
     ),
+    "homography_squared": Signature(
+        "homography",
+        (Argument("H", (3, 3), False), Argument("q1", (2,), True), Argument("q2", (2,), True), ),
+        (Argument("squared", (), True), ),
+        "squared distance of a match from a homography to first order (Sampson), c^T (dc/dq dc/dq^T)^-1 c with c = q' (h3 q) - (h1 q, h2 q) and q both points.",
+    ),
+    "homography_normal": Signature(
+        "homography",
+        (Argument("H", (3, 3), False), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("weight", (), True), ),
+        (Argument("N", (45,), False), ),
+        "J^T J by vect(H) (upper triangle) of distances from a homography, (dc/dH)^T (dc/dq dc/dq^T)^-1 dc/dH with c = q' (h3 q) - (h1 q, h2 q) and q both points.",
+    ),
+    "plane_parallax": Signature(
+        "homography",
+        (Argument("F", (3, 3), False), Argument("e2", (3,), False), Argument("q1", (2,), True), Argument("q2", (2,), True), ),
+        (Argument("kappa", (), True), Argument("gain", (), True), ),
+        "k with q' ~ [e']_x F q + k e' (plane and parallax): matches of a plane have k = v^T q. And the length that q' moves by a change of k.",
+    ),
     "canonic_squared": Signature(
         "joint",
         (Argument("P2", (3, 4), False), Argument("S", (3,), True), Argument("q", (4,), True), ),

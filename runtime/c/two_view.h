@@ -82,4 +82,18 @@ void eg_normal(eg_matches *matches, const eg_options *options, const double *F, 
 void eg_minimize(eg_matches *matches, const eg_options *options, const eg_chart *chart,
                  double *motion, double *history, eg_outcome *outcome);
 
+/* Repeated matches: copies.c. */
+EG_EXPORT ptrdiff_t eg_copies(ptrdiff_t pairs, const ptrdiff_t *offsets, const double *x1,
+                              const double *x2, ptrdiff_t *first);
+
+/* The numbers of the rules, as in the structure of quick.py. */
+typedef struct {
+    double within;           /* standard deviations that count as within the noise */
+    double wide, hidden;     /* noise beyond which agreement, and a plane, are looked at closely */
+    double tail;             /* robust deviations beyond which a match is in the tail */
+    double reach, far;       /* standard deviations off a plane through three matches, or more */
+    ptrdiff_t samples, pool; /* threes of matches, and how many they are judged by */
+    ptrdiff_t pairs, rank;   /* wrong pairs, and how many must be near */
+} eg_quick_options;
+
 #endif

@@ -6,7 +6,7 @@ import epigauge as eg
 import numpy as np
 import pytest
 from epigauge.kernels import table
-from epigauge.two_view.diagnostics import is_oriented
+from epigauge.two_view.evidence import is_oriented
 from epigauge.two_view.minima import perturbed
 from epigauge.two_view.solve import Matches
 from two_views import up_to_sign

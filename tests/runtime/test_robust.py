@@ -11,7 +11,7 @@ from epigauge import kernels
 from epigauge.errors import MissingPackageError
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.consensus import Consensus
-from epigauge.two_view.diagnostics import _by_chance
+from epigauge.two_view.planes import _by_chance
 from two_views import same_geometry
 
 INSTALLED = [

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from epigauge import lm
 from epigauge._arguments import as_array, as_count, as_matches, as_real, as_weights
 from epigauge.errors import ArgumentError
-from epigauge.two_view import native
+from epigauge.two_view import native, quick
 from epigauge.two_view._partial import Partial
 from epigauge.two_view.copies import counted_once
 from epigauge.two_view.express import completed
@@ -264,12 +264,26 @@ class _Work:
 
     def _judged(self) -> SimpleNamespace:
         """Return flags and success of all pairs."""
-        count = len(self.known["F"])
-        wholes = [None if k in self.reasons else self._whole(k) for k in range(count)]
+        found: list[tuple[tuple[str, ...] | None, bool]] = [((), False)] * len(self.known["F"])
+        for first, pairs in self.tables.items():
+            found[first : first + len(pairs.table)] = self._quickly(first, pairs)
+        for k, (flags, _) in enumerate(found):
+            if k not in self.reasons and (flags is None or k in self.results):
+                whole = self._whole(k)
+                found[k] = whole.flags, whole.success
         return SimpleNamespace(
-            flags=tuple(() if whole is None else whole.flags for whole in wholes),
-            success=np.array([whole is not None and whole.success for whole in wholes], np.bool_),
+            flags=tuple(flags or () for flags, _ in found),
+            success=np.array([success for _, success in found], np.bool_),
         )
+
+    def _quickly(self, first: int, pairs: native.Pair) -> list[tuple[tuple[str, ...] | None, bool]]:
+        """Return flags and success of a chunk as far as cheap tests suffice."""
+        last = first + len(pairs.table)
+        if self.plan.options.criterion != "reprojection":
+            return [(None, False)] * (last - first)
+        rows, offsets = self._rows(first, last), self.bounds[first : last + 1] - self.bounds[first]
+        weights = None if self.weights is None else self.weights[rows]
+        return quick.verdicts_of(pairs, self.x1[rows], self.x2[rows], offsets, weights)
 
     def _rest(self) -> SimpleNamespace:
         """Return what takes longer than the refinement, neutral for pairs that were refused."""

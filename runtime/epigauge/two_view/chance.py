@@ -24,9 +24,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.kernels import Table
-from epigauge.two_view.criteria import Reprojection
 
-__all__ = ["CEILING", "SIGNIFICANT", "chance_agreement", "independent", "log10_false_alarms"]
+__all__ = [
+    "CEILING",
+    "PAIRS",
+    "RANK",
+    "SIGNIFICANT",
+    "chance_agreement",
+    "independent",
+    "log10_false_alarms",
+]
 
 Array = NDArray[np.float64]
 
@@ -42,8 +49,7 @@ SIGNIFICANT = -3.0
 _FREE = 7
 
 #: Wrong pairs that chance is estimated from, and how many of them must lie within the distance.
-_PAIRS = 4000
-_WITHIN = 20
+PAIRS, RANK = 2000, 20
 
 
 def log10_false_alarms(m: int, k: int, chance: float) -> float:
@@ -89,7 +95,7 @@ def chance_agreement(table: Table, F: Array, q1: Array, q2: Array, limit: float)
     q1, q2 : ndarray, shape (2, m)
         All matches, right and wrong, contiguous.
     limit : float
-        The distance.
+        The distance, to first order (Sampson).
 
     Returns
     -------
@@ -97,22 +103,19 @@ def chance_agreement(table: Table, F: Array, q1: Array, q2: Array, limit: float)
         Where few wrong pairs are so near, from the density of the distance further out.
     """
     m = q1.shape[1]
-    rounds = min(-(-_PAIRS // m), m - 1)
-    shifts = np.unique(np.linspace(1, m - 1, rounds).astype(int))
-    distances = np.concatenate(
-        [
-            np.abs(
-                Reprojection(table, q1, np.ascontiguousarray(np.roll(q2, shift, axis=1)))
-                .evaluate(F)
-                .signed
-            )
-            for shift in shifts.tolist()
-        ]
-    )
+    rounds = min(-(-PAIRS // m), m - 1)
+    shifts = [1 + k * (m - 2) // max(rounds - 1, 1) for k in range(rounds)]
+    with np.errstate(all="ignore"):  # a point on an epipole
+        distances = np.concatenate(
+            [
+                np.abs(table.sampson(F, q1, np.ascontiguousarray(np.roll(q2, shift, axis=1)))[0][0])
+                for shift in shifts
+            ]
+        )
     near = int(np.count_nonzero(distances <= limit))
-    if near >= _WITHIN or near == len(distances):
+    if near >= RANK or near == len(distances):
         return near / len(distances)
-    rank = min(_WITHIN, len(distances)) - 1
+    rank = min(RANK, len(distances)) - 1
     wide = float(np.partition(distances, rank)[rank])
     return (rank + 1) / len(distances) * min(limit / wide, 1.0) if wide > 0.0 else 1.0
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import kernels, lm
-from epigauge.two_view import native
+from epigauge.two_view import native, quick
 from epigauge.two_view.assemble import assembled
 from epigauge.two_view.minima import chosen
 from epigauge.two_view.parameterizations import Ortho
@@ -80,8 +81,18 @@ def express(
     }
     # The caller may write into the arrays before the rest is computed.
     kept = None if weights is None else weights.copy()
-    complete = partial(completed, pair, 0, x1.copy(), x2.copy(), kept, options, noise_px)
-    return FundamentalResult.partial(known, complete)
+    x1, x2 = x1.copy(), x2.copy()
+    complete = partial(completed, pair, 0, x1, x2, kept, options, noise_px)
+    if options.criterion != "reprojection":
+        return FundamentalResult.partial(known, complete)
+    judge = partial(_judged, pair, x1, x2, kept)
+    return FundamentalResult.partial(known, complete, flags=judge, success=judge)
+
+
+def _judged(pair: native.Pair, x1: Array, x2: Array, weights: Array | None) -> SimpleNamespace:
+    """Return flags and success where cheap tests suffice, nothing where they do not."""
+    flags, success = quick.verdicts_of(pair, x1, x2, np.array([0, len(x1)], np.intp), weights)[0]
+    return SimpleNamespace() if flags is None else SimpleNamespace(flags=flags, success=success)
 
 
 def completed(

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge.two_view.covariance import residual_noise, tangent_basis
 from epigauge.two_view.criteria import Reprojection
-from epigauge.two_view.diagnostics import Evidence, evidence
 from epigauge.two_view.essential import Motion
+from epigauge.two_view.evidence import Evidence, evidence
 from epigauge.two_view.five_point import log_cost
 from epigauge.two_view.losses import Loss
 from epigauge.two_view.solve import Matches, Options, Solution, joined, minimize

@@ -13,7 +13,8 @@ from epigauge.errors import ArgumentError
 from epigauge.lm import Row
 from epigauge.two_view._partial import Partial
 from epigauge.two_view.covariance import Uncertainty
-from epigauge.two_view.diagnostics import Evidence, diagnose
+from epigauge.two_view.diagnostics import diagnose
+from epigauge.two_view.evidence import Evidence
 from epigauge.two_view.minima import Minimum
 
 __all__ = ["FundamentalResult"]

@@ -1,0 +1,76 @@
+"""The cheap tests of plain pairs say what the whole diagnosis says, or nothing."""
+
+from __future__ import annotations
+
+import epigauge as eg
+import numpy as np
+import pytest
+from epigauge.kernels import available
+from epigauge.two_view import native, quick
+from epigauge.two_view.refine import plan_of
+from two_views import Array, scene
+
+needs_c = pytest.mark.skipif(available()["c"] is not None, reason="needs the C library")
+
+
+def quickly(
+    x1: Array, x2: Array, weights: Array | None = None
+) -> tuple[tuple[str, ...] | None, bool]:
+    """The verdict of the cheap tests alone."""
+    offsets = np.array([0, len(x1)], np.intp)
+    options = plan_of({}).native
+    assert options is not None
+    pair = native.refine_pairs(x1, x2, offsets, None, weights, options)
+    return quick.verdicts_of(pair, x1, x2, offsets, weights)[0]
+
+
+def kinds() -> list[tuple[str, Array, Array]]:
+    """Pairs of all kinds: healthy, weak, planar, turned, still, half wrong, random."""
+    rng = np.random.default_rng(11)
+    found = []
+    for m, noise in ((20, 0.3), (60, 1.0), (400, 0.5)):
+        found += [(kind, *scene(kind, m, noise, rng)) for kind in ("general", "planar", "rotation")]
+        x1, x2 = scene("general", m, noise, rng)
+        found.append(("still", x1, x1 + noise * rng.standard_normal(x1.shape)))
+        wrong = rng.permutation(m)[: m // 3]
+        x2 = x2.copy()
+        x2[wrong] = rng.uniform([0.0, 0.0], [1024.0, 768.0], (len(wrong), 2))
+        found.append(("wrong", x1, x2))
+        found.append(("random", *rng.uniform([0.0, 0.0], [1024.0, 768.0], (2, m, 2))))
+    for distance in (4.0, 8.0, 10.0, 16.0):
+        view = eg.two_view_scene(distance, seed=5)
+        found.append(("weak", view.x1, view.x2))
+    return found
+
+
+@needs_c
+@pytest.mark.parametrize("case", kinds(), ids=lambda case: f"{case[0]}-{len(case[1])}")
+def test_c_numpy_and_the_batch_agree(case) -> None:
+    kind, x1, x2 = case
+    whole = eg.refine_fundamental(x1, x2, backend="numpy")
+    flags, success = quickly(x1, x2)
+    assert (flags is not None) == (kind in ("general", "weak"))
+    if flags is not None:
+        assert (flags, success) == (whole.flags, whole.success)
+    single = eg.refine_fundamental(x1, x2)
+    batch = eg.refine_fundamental_batch(x1, x2, [0, len(x1)])
+    assert single.flags == batch.flags[0] == whole.flags
+    assert single.success == batch.success[0] == whole.success
+
+
+@needs_c
+def test_matches_of_weight_zero_do_not_count() -> None:
+    x1, x2 = scene("general", 80, 0.5, np.random.default_rng(2))
+    w = np.ones(80)
+    w[::4] = 0.0
+    x2[::4] += 300.0
+    assert quickly(x1, x2, w) == quickly(x1[w > 0].copy(), x2[w > 0].copy()) == ((), True)
+
+
+@needs_c
+def test_points_that_many_are_matched_to_count_once() -> None:
+    view = eg.two_view_scene(16.0, seed=3)
+    x1, x2 = view.x1.copy(), view.x2.copy()
+    assert quickly(x1, x2)[0] is not None
+    x2[10:] = x2[10]  # every line through this point agrees
+    assert quickly(x1, x2)[0] is None
