@@ -265,7 +265,7 @@ class MetricCovariance:
 
     def _sigma(self, parts: Sequence[tuple[str, int]], slope: Array) -> float:
         variance = float(slope @ self.joint(parts) @ slope)
-        return max(variance, 0.0) ** 0.5
+        return float(max(variance, 0.0) ** 0.5)
 
     @cached_property
     def std(self) -> Std:
