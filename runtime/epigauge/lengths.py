@@ -30,8 +30,8 @@ _THIN = 1e-3
 _erf = np.vectorize(math.erf, otypes=[np.float64])
 
 
-def linear_length(mean: Array, covariance: Array) -> tuple[Array, float]:
-    """Return the slope of |q| in q, and the variance that it leaves.
+def linear_length(mean: Array, covariance: Array) -> tuple[Array, float, float]:
+    """Return the slope of |q| in q, the variance that it leaves, and the mean.
 
     Parameters
     ----------
@@ -45,14 +45,16 @@ def linear_length(mean: Array, covariance: Array) -> tuple[Array, float]:
     slope : ndarray, shape (2,)
         w in |q| = w . q + rest; the derivative q / |q| where that is far from zero.
     rest : float
-        Variance of the rest. Both depend continuously on the arguments.
+        Variance of the rest.
+    length : float
+        Mean of |q|; far from zero, |q| of the mean. All depend continuously on the arguments.
     """
     size = float(np.hypot(*mean))
     derivative = mean / size if size > 0.0 else np.zeros(2)
     variances, axes = np.linalg.eigh(covariance)
     largest = math.sqrt(max(float(variances[1]), 0.0))
     if size >= _FAR * largest:
-        return derivative, 0.0
+        return derivative, 0.0, size
     variances = np.maximum(variances, (_THIN * largest) ** 2)
     slope, length = _mean_slope(axes.T @ mean, variances)
     slope = axes @ slope
@@ -60,7 +62,8 @@ def linear_length(mean: Array, covariance: Array) -> tuple[Array, float]:
     rest = size**2 + float(variances.sum()) - length**2 - float(slope @ covariance @ slope)
     share = min(max((_FAR - size / largest) / (_FAR - _NEAR), 0.0), 1.0)
     share *= share * (3.0 - 2.0 * share)
-    return derivative + share * (slope - derivative), share * max(rest, 0.0)
+    slope = derivative + share * (slope - derivative)
+    return slope, share * max(rest, 0.0), size + share * (length - size)
 
 
 def _mean_slope(mean: Array, variances: Array) -> tuple[Array, float]:

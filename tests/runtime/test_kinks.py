@@ -116,7 +116,8 @@ def test_slope_and_rest_of_a_length_are_those_of_samples(mean: Array, covariance
     length = np.hypot(*q.T)
     together = np.cov(np.column_stack([q, length]).T)
     expected = np.linalg.solve(together[:2, :2], together[:2, 2])
-    slope, rest = linear_length(np.asarray(mean), np.asarray(covariance))
+    slope, rest, mean_length = linear_length(np.asarray(mean), np.asarray(covariance))
+    assert mean_length == pytest.approx(length.mean(), rel=0.02)
     np.testing.assert_allclose(slope, expected, atol=0.03)
     left = together[2, 2] - expected @ together[:2, :2] @ expected
     assert rest == pytest.approx(left, rel=0.05)
@@ -124,11 +125,12 @@ def test_slope_and_rest_of_a_length_are_those_of_samples(mean: Array, covariance
 
 def test_a_length_is_linear_far_from_zero_and_continuous_on_the_way() -> None:
     covariance = np.array([[1.0, 0.2], [0.2, 0.7]])
-    slope, rest = linear_length(np.array([30.0, 40.0]), covariance)
+    slope, rest, length = linear_length(np.array([30.0, 40.0]), covariance)
+    assert length == 50.0
     np.testing.assert_array_equal(slope, [0.6, 0.8])
     assert rest == 0.0
     ways = [linear_length(s * np.array([0.6, 0.8]), covariance) for s in np.linspace(0, 12, 600)]
-    slopes, rests = np.array([w for w, _ in ways]), np.array([v for _, v in ways])
+    slopes, rests = np.array([way[0] for way in ways]), np.array([way[1] for way in ways])
     assert np.abs(np.diff(slopes, axis=0)).max() < 0.02
     assert np.abs(np.diff(rests)).max() < 0.01
     np.testing.assert_allclose(slopes[0], 0.0, atol=1e-12)

@@ -112,7 +112,7 @@ class ReconstructionCovariance:
         covariance_of_q = self._variance * moved.T @ self._inverse.apply(moved)
         values = np.linalg.svd(H, compute_uv=False)
         mean = np.array([0.5 * (values[0] - values[1]), 0.0])
-        slope, rest = linear_length(mean, 0.5 * (covariance_of_q + covariance_of_q.T))
+        slope, rest, _ = linear_length(mean, 0.5 * (covariance_of_q + covariance_of_q.T))
         if rest == 0.0:
             return self
         # H* and the points' last coordinates grow together.

@@ -115,9 +115,10 @@ class Uncertainty:
         if not np.isfinite(covariance).all():
             return float("inf")
         p, q = 0.5 * (1.0 + sigma), 0.5 * (1.0 - sigma)
-        slope, rest = linear_length(np.array([q, 0.0]), covariance[1:, 1:])
-        derivative = 2.0 * q * by_halves[:1] - 2.0 * p * slope @ by_halves[1:]
-        return float(np.sqrt(self._propagated(derivative)[0, 0] + 4.0 * p**2 * rest))
+        slope, rest, length = linear_length(np.array([q, 0.0]), covariance[1:, 1:])
+        derivative = 2.0 * length * by_halves[:1] - 2.0 * p * slope @ by_halves[1:]
+        variance = self._propagated(derivative)[0, 0] + 4.0 * p**2 * rest
+        return float(np.sqrt(variance)) / (p + length) ** 2
 
     def largest(self) -> float:
         """Return the largest standard deviation of the conditioned F of unit norm."""
