@@ -111,6 +111,12 @@ static void dampings(state *s)
     }
 }
 
+/* Of numbers that are not negative; NaN is none of them. */
+static inline double larger(double most, double value)
+{
+    return value > most ? value : most;
+}
+
 static double mean_diagonal(ptrdiff_t count, ptrdiff_t size, const double *blocks)
 {
     double most = 0.0;
@@ -118,7 +124,7 @@ static double mean_diagonal(ptrdiff_t count, ptrdiff_t size, const double *block
         double sum = 0.0;
         for (ptrdiff_t k = 0; k < size; ++k)
             sum += blocks[size * size * i + (size + 1) * k];
-        most = fmax(most, sum / (double)size);
+        most = larger(most, sum / (double)size);
     }
     return most;
 }
@@ -186,9 +192,9 @@ static eg_lm_system linearize(void *self, double lam)
     }
     eg_bundle_camera_blocks(s->bundle, s->sums, s->U, s->D, s->g);
     for (ptrdiff_t k = 0; k < s->n * s->d; ++k)
-        system.steepest = fmax(system.steepest, fabs(s->g[k]));
+        system.steepest = larger(system.steepest, fabs(s->g[k]));
     for (ptrdiff_t k = 0; k < s->m * s->b; ++k)
-        system.steepest = fmax(system.steepest, fabs(s->g_points[k]));
+        system.steepest = larger(system.steepest, fabs(s->g_points[k]));
     system.size = fmax(mean_diagonal(s->n, s->d, s->U), mean_diagonal(s->m, s->b, s->V));
     dampings(s);
     return system;
