@@ -193,8 +193,7 @@ def fit_homographies(x1: Array, x2: Array, first: Indices) -> Homographies:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             distances = np.linalg.norm(h[:, :2] / h[:, 2:] - b, axis=1)
         distances = np.nan_to_num(distances, nan=1e3, posinf=1e3)
-        medians = [np.median(part) for part in np.split(distances, first[1:-1])]
-        typical = np.maximum(np.array(medians), 1e-9)[group]
+        typical = np.maximum(_medians(distances, group, first), 1e-9)[group]
         # Algebraic errors are h_3 times geometric ones.
         depth = h[:, 2] ** 2 / np.repeat(_means(h[:, 2] ** 2, first), np.diff(first))
         weights = 1.0 / (1.0 + (distances / typical) ** 2) / np.maximum(depth, 1e-6)
@@ -207,6 +206,12 @@ def fit_homographies(x1: Array, x2: Array, first: Indices) -> Homographies:
         :, None, None
     ]
     return Homographies(H / size[:, None, None], scale * distances, covariance, scale)
+
+
+def _medians(values: Array, group: Indices, first: Indices) -> Array:
+    rising = values[np.lexsort((values, group))]
+    low, high = (first[:-1] + first[1:] - 1) // 2, (first[:-1] + first[1:]) // 2
+    return np.asarray(0.5 * (rising[low] + rising[high]))
 
 
 def _means(values: Array, first: Indices) -> Array:
