@@ -397,3 +397,8 @@ def test_what_no_reconstruction_shows_is_kept_as_it_comes_first() -> None:
     first, _, _ = eg.Tracks.pruned(view, point, xy, repeated="first")
     np.testing.assert_array_equal(found.xy[found.view == 4], first.xy[first.view == 4])
     np.testing.assert_array_equal(found.xy[found.view < 4], tracks.xy[tracks.view < 4])
+
+
+def test_the_image_whose_size_is_refused_is_named() -> None:
+    with pytest.raises(ArgumentError, match=r"\[640, 0\] in row 1"):
+        eg.Tracks(**_twice_seen(), repeated=True, sizes=[[640, 480], [640, 0]])
