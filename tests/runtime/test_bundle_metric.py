@@ -11,6 +11,8 @@ import many_views
 import numpy as np
 import pytest
 from epigauge import kernels
+from epigauge.bundle import compiled
+from epigauge.bundle import problem as problem_module
 from epigauge.bundle.dampings import Covariant
 from epigauge.bundle.jobs import metric_job
 from epigauge.bundle.observations import ObservationGraph
@@ -245,6 +247,20 @@ def similarity(seed: int, size: float = 1.0) -> Similarity:
     far *= s * size * 10.0 ** rng.uniform(0, 5) / np.linalg.norm(far)
     made: Similarity = eg.gauge.similarity(s, Q * np.sign(np.linalg.det(Q)), far)
     return made
+
+
+def test_bounds_of_every_focal_length_hold_in_both_loops(monkeypatch: pytest.MonkeyPatch) -> None:
+    many_views.need_backend("c")
+    tracks, start = scene("PINHOLE", ((900.0, 990.0, 320.0, 240.0),) * 4, range(4))
+    for module in (compiled, problem_module):
+        monkeypatch.setattr(module, "MAX_FOCAL", 990.5)
+    options = {"refine": ("fx", "fy"), "max_iter": 8}
+    runs = [eg.bundle_adjust(tracks, start, backend=name, **options) for name in ("c", "numpy")]
+    costs = [[row.cost for row in run.history] for run in runs]
+    assert np.inf in costs[0]
+    np.testing.assert_allclose(*costs, rtol=1e-6)
+    for run in runs:
+        assert (run.reconstruction.cameras.params[:, :2] <= 990.5).all()
 
 
 class TestInvariance:
