@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import epigauge as eg
 import numpy as np
 import pytest
@@ -156,3 +158,33 @@ def test_a_match_on_both_epipoles_is_left_out_of_the_equations(monkeypatch):
         assert np.isfinite(result.F).all()
         assert same_geometry(result.F, a.F, scene.x1, scene.x2) < 1e-6
     assert a.history[1].cost == pytest.approx(b.history[1].cost, rel=1e-6)
+
+
+def test_an_ill_conditioned_minimum_is_recognised_at_once(monkeypatch):
+    # Nearly flat: the Hessian's condition is beyond what a Cholesky factor proves.
+    scene = two_view_scene(5.0, n_points=60, noise_px=0.0, seed=3)
+    X = scene.X * [1.0, 1.0, 1e-4, 1.0]
+    rng = np.random.default_rng(0)
+    x1, x2 = (
+        h[:, :2] / h[:, 2:] + 1e-6 * rng.standard_normal((60, 2))
+        for h in (X @ scene.P1.T, X @ scene.P2.T)
+    )
+    start = eg.refine_fundamental(x1, x2, scene.F_true, ftol=1e-14).F
+    for result in both(monkeypatch, x1, x2, F0=start, ftol=1e-3, gtol=0.0):
+        assert 1e5 < result.condition < 1e7
+        assert (result.status, result.nfev) == (4, 1)
+
+
+def test_exact_matches_end_at_the_rounding_of_the_data(monkeypatch):
+    scene = two_view_scene(6.0, n_points=40, noise_px=0.0, seed=5)
+    for result in both(monkeypatch, scene.x1, scene.x2, F0=scene.F_true):
+        assert (result.status, result.nfev) == (5, 1)
+
+
+def test_rows_tell_the_time():
+    scene = two_view_scene(6.0, n_points=2000, seed=5)
+    begun = time.perf_counter()
+    history = eg.refine_fundamental(scene.x1, scene.x2, backend="c").history
+    seconds = [row.seconds for row in history]
+    assert seconds == sorted(seconds)
+    assert 0.0 <= seconds[0] < seconds[-1] < time.perf_counter() - begun
