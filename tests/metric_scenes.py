@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 #: All models whose cameras have a rotation and a position.
 METRIC = tuple(name for name, model in models().items() if model.metric)
 #: Those that COLMAP has too.
-COLMAP = tuple(name for name in METRIC if name.isupper() and name != "EQUIRECTANGULAR")
+COLMAP = tuple(name for name in METRIC if name.isupper())
 
 
 def parameters(model: str, count: int, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -11,7 +11,8 @@ PoseLib and epigauge agree, and F can be passed on as it is. What differs is
 - **motion**: ``x2 = R x1 + t`` in the frames of the cameras, in all of them.
 
 Arrays of OpenCV's shape (m, 1, 2), integers and float32 are taken by every function of epigauge.
-BAL problems are read and written by `load_tracks` and `save_tracks`.
+BAL problems are read and written by `load_scene` and `save_scene`; `bal_to_colmap` and
+`colmap_to_bal` change between their cameras and COLMAP's.
 """
 
 from __future__ import annotations
@@ -31,10 +32,13 @@ from epigauge._arguments import (
     as_matches,
     as_real,
 )
+from epigauge.cameras.bal import bal_to_colmap, colmap_to_bal
 from epigauge.errors import ArgumentError, MissingPackageError
 from epigauge.two_view.free import fundamental_from_cameras
 
 __all__ = [
+    "bal_to_colmap",
+    "colmap_to_bal",
     "from_colmap",
     "from_opencv",
     "from_poselib",

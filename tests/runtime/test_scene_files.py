@@ -117,7 +117,9 @@ def test_colmap_reads_what_is_written(tmp_path: Path, model: str, text: bool) ->
         assert point.track.length() == np.count_nonzero(tracks.point == j - 1)
     errors = {j: point.error for j, point in read.points3D.items()}
     read.update_point_3d_errors()
-    assert all(abs(read.points3D[j].error - error) < 1e-9 for j, error in errors.items())
+    # COLMAP measures spherical images by angles, to which the stored pixels are near.
+    limit = 0.02 if model == "EQUIRECTANGULAR" else 1e-9
+    assert all(abs(read.points3D[j].error - error) < limit for j, error in errors.items())
 
 
 @pytest.mark.parametrize("name", ["p.txt", "p.txt.gz", "p.txt.bz2", "p.bal"])
@@ -300,7 +302,7 @@ def test_what_a_form_has_no_place_for_is_named(tmp_path: Path) -> None:
         ("images of 2 sizes by camera 0", "o", (sized, radial[1]), {}),
         ("tracks.weights", "o", (heavy, radial[1]), {}),
         ("white space", "o", (blank, radial[1]), {"text": True}),
-        ("'SIMPLE_RADIAL'; needed: 'bal'", "o.txt", radial, {}),
+        ("'SIMPLE_RADIAL'; needed: eg.interop.colmap_to_bal", "o.txt", radial, {}),
         ("2 cameras for 4 views", "o.txt", shared, {}),
         ("tracks.weights", "o.txt", (weighted, scene), {}),
         ("tracks.names", "o.txt", (named, scene), {}),
@@ -446,3 +448,47 @@ def test_bad_arrays_are_refused_by_name(
         changed = dict(arrays) | {name: value}
     np.savez(path, **changed)
     assert told in refusal(eg.load_scene, path)
+
+
+@pytest.mark.parametrize("given", [(1024, 768), [(1024, 768), (800, 600), (1024, 768), (64, 48)]])
+def test_bal_scenes_become_colmap_s_and_back(tmp_path: Path, given: Any) -> None:
+    tracks, scene = metric_scene("bal", 2, noise_px=0.5)
+    moved, same = eg.interop.bal_to_colmap(tracks, scene, given)
+    residuals, expected = moved.xy - same.project(moved), tracks.xy - scene.project(tracks)
+    assert np.abs(residuals - expected * np.array([1.0, -1.0])).max() < 1e-10
+    assert np.array_equal(same.depths(moved) > 0.0, scene.depths(tracks) > 0.0)
+    eg.save_scene(tmp_path / "folder", moved, same)
+    read, found = eg.load_scene(tmp_path / "folder")
+    assert found.cameras.model == "RADIAL"
+    assert np.array_equal(read.sizes, np.broadcast_to(given, (4, 2)))
+    back, last = eg.interop.colmap_to_bal(read, found)
+    assert np.abs(back.xy - tracks.xy).max() < 1e-9
+    assert np.abs(last.project(back) - scene.project(tracks)).max() < 1e-9
+    eg.save_scene(tmp_path / "again.txt", back, last)
+    assert eg.load_scene(tmp_path / "again.txt")[0].n_views == 4
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"])
+def test_radial_scenes_become_bal_s(model: str) -> None:
+    tracks, scene = metric_scene(model, 2, noise_px=0.5)
+    moved, same = eg.interop.colmap_to_bal(tracks, scene)
+    residuals, expected = moved.xy - same.project(moved), tracks.xy - scene.project(tracks)
+    assert np.abs(residuals - expected * np.array([1.0, -1.0])).max() < 1e-10
+
+
+def test_scenes_that_cannot_change_sides_are_told_how(tmp_path: Path) -> None:
+    tracks, scene = metric_scene("bal", 2)
+    with pytest.raises(eg.ArgumentError, match="bal_to_colmap"):
+        eg.save_scene(tmp_path / "folder", tracks, scene)
+    with pytest.raises(eg.ArgumentError, match="image_size is not known"):
+        eg.interop.bal_to_colmap(tracks, scene)
+    for size in ((0, 5), (1.5, 2.0), (1, 2, 3)):
+        with pytest.raises(eg.ArgumentError, match="image_size"):
+            eg.interop.bal_to_colmap(tracks, scene, size)
+    radial, other = metric_scene("SIMPLE_RADIAL", 2), metric_scene("OPENCV", 2)
+    with pytest.raises(eg.ArgumentError, match="colmap_to_bal"):
+        eg.save_scene(tmp_path / "s.txt", *radial)
+    with pytest.raises(eg.ArgumentError, match="OPENCV"):
+        eg.interop.colmap_to_bal(*other)
+    with pytest.raises(eg.ArgumentError, match="SIMPLE_RADIAL"):
+        eg.interop.bal_to_colmap(*radial, (640, 480))

@@ -300,7 +300,10 @@ def _camera_rows(
     name = "PINHOLE" if cameras.model == "pinhole" else cameras.model
     if name not in NUMBERS:
         was = f"has cameras of the model {cameras.model!r}, which COLMAP does not know"
-        raise ArgumentError("reconstruction", was, f"one of {', '.join(NUMBERS)}; NPZ keeps all")
+        needed = f"one of {', '.join(NUMBERS)}; NPZ keeps all"
+        if cameras.model == "bal":
+            needed = "eg.interop.bal_to_colmap(tracks, reconstruction, image_size), or NPZ"
+        raise ArgumentError("reconstruction", was, needed)
     ids = np.arange(1, len(cameras) + 1)
     rows = []
     if known is not None and np.array_equal(known.camera_of_view, cameras.camera_of_view):

@@ -95,7 +95,7 @@ def load_scene(
     elif path.suffix.lower() in _BAL:
         raw = _read_bal(path)
     else:
-        was = f"is {str(path)!r}"
+        was = f"is {str(path)!r}" if path.exists() else f"is {str(path)!r}, which does not exist"
         raise ArgumentError("path", was, f"a COLMAP folder, or a name ending in .npz, {_listed()}")
     return finished(path, raw, repeated, weak)
 
@@ -229,7 +229,10 @@ def _nine_numbers(tracks: Tracks, reconstruction: MetricReconstruction) -> Array
     cameras = reconstruction.cameras
     if cameras.model != "bal":
         was = f"has cameras of the model {cameras.model!r}"
-        raise ArgumentError("reconstruction", was, "'bal': a BAL problem has no other; NPZ has all")
+        needed = "'bal': a BAL problem has no other; NPZ has all"
+        if cameras.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+            needed = "eg.interop.colmap_to_bal(tracks, reconstruction), or NPZ"
+        raise ArgumentError("reconstruction", was, needed)
     if len(cameras) < tracks.n_views:
         was = f"has {len(cameras)} cameras for {tracks.n_views} views"
         needed = "a camera a view: Cameras('bal', cameras.of_views, range(n)); NPZ keeps them"
