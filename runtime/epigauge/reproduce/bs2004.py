@@ -54,7 +54,8 @@ def introduction(study: Study) -> list[str]:
         "centre from 10 m, baseline 1 m, noise of 2 px variance; one quantity is varied at a time. "
         "The same seed gives the same points and the same noise in every configuration. Errors "
         "and counts repeat on a processor; on another one sums round differently, and where "
-        "several minima are near, that may decide. Times depend on the machine.",
+        "several minima are near, that may decide. Times depend on the machine, and on what else "
+        "it does meanwhile.",
         "The variations that section 5.1.2 mentions without numbers, of the focal length and of "
         "the baseline, are repeated as well. The paper's photographs are not available: Table 4 "
         "has other pairs.",
