@@ -8,10 +8,10 @@ from typing import Any
 import epigauge as eg
 import numpy as np
 import pytest
-from epigauge.reproduce import essential, gauge_runs, successes, sweeps
+from epigauge.reproduce import essential, gauge_runs, gauge_variations, successes, sweeps
 from epigauge.reproduce.common import METHODS
 from epigauge.reproduce.gauge_runs import LABELS, GaugeStudy
-from epigauge.reproduce.report import Claim, lower
+from epigauge.reproduce.report import Claim, Table, fewest, lower
 
 
 def test_a_verdict_is_that_of_the_numbers() -> None:
@@ -25,6 +25,57 @@ def test_numbers_too_near_one_another_are_a_tie_whatever_their_order() -> None:
     assert lower(1.1, 1.0, 0.05) is False
     assert lower(1.0, 1.02, 0.05) is lower(1.02, 1.0, 0.05) is None
     assert lower(0.0, 0.0, 0.05) is None
+
+
+def test_fewest_is_a_tie_where_any_is_one_and_none_is_higher() -> None:
+    assert fewest([1.0, 2.0], [1.5, 2.5]) is True
+    assert fewest([1.0, 2.5], [1.5, 2.5]) is None
+    assert fewest([1.0, 3.0], [1.5, 2.5]) is False
+    assert fewest([1.5, 3.0], [1.5, 2.5]) is False
+    assert fewest([3], [3], 0.0) is None
+
+
+def _runs(stopped: float) -> list[Any]:
+    most = essential.MAX_ITER
+    return [SimpleNamespace(evaluations=most + 1 if k < 100 * stopped else 9) for k in range(100)]
+
+
+@pytest.mark.parametrize(("moved", "scaled"), [(0.4, 0.0), (0.0, 0.4)])
+def test_the_cause_is_told_by_the_numbers(moved: float, scaled: float) -> None:
+    found = {
+        (case, label, method.label): _runs(0.0)
+        for case in essential._CASES
+        for label in essential._DAMPINGS
+        for method in essential._METHODS
+    }
+    for label in essential._DAMPINGS:
+        found[essential._BOTH, label, "ORTHO"] = _runs(0.4)
+        found[essential._MOVED, label, "ORTHO"] = _runs(moved)
+        found[essential._SCALED, label, "ORTHO"] = _runs(scaled)
+    text = essential._cause(found)
+    assert "Fewer runs of BLOCK" in text
+    first, second = text.split("quarter of the RMS ")[1].split(", the retina divided")
+    assert first.startswith("cures it" if moved == 0.0 else "does not cure it")
+    assert ("cures it" in second) == (scaled == 0.0)
+
+
+def test_variations_have_a_row_a_method_and_a_verdict_a_quantity(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    varied = {"n_points": ("points", (15, 40)), "start": ("error", (0.05, 0.0))}
+    monkeypatch.setattr(gauge_variations, "_VARIED", varied)
+    section = gauge_variations.variations(GaugeStudy(trials=1))
+    tables = [item for item in section.content if isinstance(item, Table)]
+    assert [table.name for table in tables] == ["varied_n_points", "varied_start"]
+    for table, claim in zip(tables, section.claims, strict=True):
+        steps = np.array([row[1:] for row in table.rows[:-1]], dtype=float)
+        assert len(steps) == len(gauge_variations._METHODS)
+        paper = steps[: gauge_variations._COMPARED]
+        weak, strong = paper.max(axis=0) / paper.min(axis=0)
+        assert claim.confirmed is lower(strong, weak, 0.05)
+    tracks, start = gauge_variations._configuration(0, "start", 0.05)
+    _, plain = gauge_variations._configuration(0, "start", 0.0)
+    assert start.rms_px(tracks) > 2.0 * plain.rms_px(tracks)
 
 
 def test_times_are_in_the_papers_order_or_not() -> None:

@@ -110,7 +110,7 @@ def lower(ours: float, others: float, within: float) -> bool | None:
     """Tell whether a number is lower than another; None where they differ by less than a part."""
     if abs(ours - others) <= within * max(abs(ours), abs(others)):
         return None
-    return ours < others
+    return bool(ours < others)
 
 
 def fewest(ours: Sequence[float], others: Sequence[float], within: float = 0.02) -> bool | None:
