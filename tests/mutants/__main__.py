@@ -69,11 +69,12 @@ def main() -> int:
     if options.again or options.only:
         done = {key: row for key, row in done.items() if row["verdict"] == "killed"}
     rows = []
+    sound: set[str] = set()
     for number, fault in enumerate(faults, 1):
         text = (scratch.path / fault.file).read_text()
         row = done.get((fault.file, *fault.lines(text)))
         if row is None:
-            row = _tried(scratch, fault, text, reach)
+            row = _noticed(scratch, fault, text, reach, sound)
             with results.open("a") as file:
                 file.write(json.dumps(row) + "\n")
         rows.append(row)
@@ -128,6 +129,22 @@ def _test_files(root: Path, of: set[str] | None) -> list[str]:
     chosen = [entry for entry in areas() if of is None or entry["name"] in of]
     named = {f"tests/{test}" for entry in chosen for test in entry["tests"]}
     return sorted(name for name in named if (root / name).is_file())
+
+
+def _noticed(
+    scratch: Scratch, fault: Fault, text: str, reach: Reach, sound: set[str]
+) -> dict[str, object]:
+    """Return what comes of a fault; a test that fails without it, too, does not count."""
+    while True:
+        row = _tried(scratch, fault, text, reach)
+        test = str(row["detail"])
+        if row["verdict"] != "killed" or test not in reach.seconds or test in sound:
+            return row
+        if first_failure(scratch, [test], _SECONDS)[0] == PASSED:
+            sound.add(test)
+            return row
+        print(f"left out, since it fails without any fault: {test}", flush=True)
+        del reach.seconds[test]
 
 
 def _tried(scratch: Scratch, fault: Fault, text: str, reach: Reach) -> dict[str, object]:
