@@ -200,7 +200,7 @@ def test_names_of_any_kind_are_text(database) -> None:
 
 # mutated
 
-_ROUNDS = 60
+_ROUNDS = 40
 
 
 def mutated(data: bytes, random: np.random.Generator) -> bytes:

@@ -238,7 +238,7 @@ def test_every_measured_set_loads(data_dir, monkeypatch):
     assert set(eg.datasets.arrays("bal_49")) == {"view", "point", "xy", "P", "Q"}
 
 
-@pytest.mark.parametrize("name", [*ORIGINALS, "bal_16"])
+@pytest.mark.parametrize("name", [*ORIGINALS, pytest.param("bal_16", marks=pytest.mark.slow)])
 def test_download_gives_the_arrays_of_the_measured_sets(name, data_dir, served, cache, monkeypatch):
     """The sums in the catalogue are those of the original files, and so are the arrays."""
     pytest.importorskip("scipy")
