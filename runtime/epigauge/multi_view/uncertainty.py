@@ -289,7 +289,8 @@ def covariance(
         Standard deviation of an image coordinate of weight one. By default estimated from the
         residuals: sqrt(sum of weighted squares / (2 N - 11 n - 3 m + 15)), with a robust loss over
         those within three standard deviations, freed from the pull of the others
-        (`epigauge.multi_view.sandwich.RobustFit`).
+        (`epigauge.multi_view.sandwich.RobustFit`). Priors count beside this noise; where it is
+        estimated, beside the `sigma` of the tracks, and the variance factor is that of all.
     loss : {"linear", "huber", "soft_l1", "cauchy", "truncated"}
         What the reconstruction was adjusted with. Under a robust loss the covariance is that of an
         M-estimate, A^-1 B A^-1, with wrong observations counted one by one.

@@ -389,6 +389,8 @@ def metric_covariance(
 ) -> MetricCovariance:
     """Return the covariance of an adjusted calibrated reconstruction; see `eg.covariance`."""
     tracks = tracks.merged()[0]
+    if noise_px is not None:
+        noise_px = as_positive("noise_px", noise_px)
     job = metric_job(
         tracks,
         reconstruction,
@@ -396,6 +398,7 @@ def metric_covariance(
         fixed_views=tuple(fixed_views),
         fixed_points=tuple(fixed_points),
         priors=priors,
+        noise_px=tracks.unit if noise_px is None else noise_px,
     )
     table = kernels.table(backend)
     graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
@@ -420,11 +423,9 @@ def metric_covariance(
     reference = NumpyLinearizer(job.model, table, graph, job.q, weights, Loss(), job.stretch)
     inverse = Inverse.of(system, reference, priors_there, table)
     redundancy = _redundancy(tracks, job, inverse)
-    if noise_px is not None:
-        noise_px = as_positive("noise_px", noise_px)
-    elif redundancy <= 0:
-        raise ArgumentError("noise_px", "is not given", "a number: nothing is redundant")
-    else:
+    if noise_px is None:
+        if redundancy <= 0:
+            raise ArgumentError("noise_px", "is not given", "a number: nothing is redundant")
         noise_px = float(np.sqrt(2.0 * state.cost / redundancy))
     return MetricCovariance(
         reconstruction,
