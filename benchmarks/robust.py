@@ -1,12 +1,15 @@
 """How near the truth robust estimates from raw matches come, against the peers that are installed.
 
-    python benchmarks/robust.py [--pairs DIRECTORY] [--trials 40]
+    python benchmarks/robust.py [--pairs DIRECTORY] [--sets FILE ...] [--trials 40]
 
 First every measured pair with a true F or with check points, then the scene of Bartoli & Sturm
 2004, section 5.1.1, with 500 points (10 m, noise sqrt 2 px) some of which are replaced by points
 uniform over the bounding box. Cells are pixels / milliseconds. The error of a true match is the
 mean of the distances of both its noise-free points to their epipolar lines; a pair's is the median
-over its true matches, a scene's the mean, and the median over the trials.
+over its true matches, a scene's the mean, and the median over the trials. Sets are files of many
+pairs each, with true F and raw matches; of them AUC, the mean over the pairs of max(0, 1 - error)
+with the mean error in pixels over at most 200 true matches, the share of pairs below 1 px, and the
+median milliseconds.
 """
 
 from __future__ import annotations
@@ -91,6 +94,21 @@ def measured(directory: Path) -> dict[str, tuple[Array, Array, Array, Array]]:
     return pairs
 
 
+def one_set(path: Path) -> list[tuple[Array, Array, Array, Array]]:
+    """Return raw matches and true matches of all pairs of a set."""
+    pairs = []
+    with np.load(path) as data:
+        bounds, all1, all2 = data["offsets"], data["x1"].astype(float), data["x2"].astype(float)
+        right = data["true_distance_px"] <= 0.5
+        for F, *ends in zip(data["F_true"], bounds[:-1], bounds[1:], strict=True):
+            rows = slice(*ends)
+            x1, x2 = all1[rows], all2[rows]
+            chosen = np.flatnonzero(right[rows])
+            chosen = chosen[:: -(-len(chosen) // 200)]
+            pairs.append((x1, x2, *eg.reprojection_distances(F, x1[chosen], x2[chosen])[1:]))
+    return pairs
+
+
 def simulated(share: float, seed: int) -> tuple[Array, Array, Array, Array]:
     """Return matches, a share of them wrong, and the true matches."""
     scene = eg.two_view_scene(n_points=500, noise_px=NOISE_PX, seed=seed)
@@ -115,6 +133,7 @@ def main() -> None:
     """Print the tables as Markdown."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pairs", type=Path, help="directory of the measured pairs")
+    parser.add_argument("--sets", type=Path, nargs="*", default=[], help="files of many pairs")
     parser.add_argument("--trials", type=int, default=40)
     arguments = parser.parse_args()
     peers = {n: f for n, (module, f) in PEERS.items() if importlib.util.find_spec(module)}
@@ -133,7 +152,21 @@ def main() -> None:
             ("geometric mean of the pairs", np.exp(np.mean(np.log(table), axis=0))),
         ):
             print(f"| {label} |", " | ".join(f"{e:.3f}" for e in value), "|", flush=True)
-    for share in (0.0, 0.3, 0.5):
+    for path in arguments.sets:
+        results = []
+        for x1, x2, t1, t2 in one_set(path):
+            found = [timed(f, x1, x2, PAIR_THRESHOLD_PX) for f in peers.values()]
+            results.append([(float(np.mean(errors(F, t1, t2))), ms) for F, ms in found])
+        error, ms = np.moveaxis(np.array(results), -1, 0)
+        auc, below = np.mean(np.maximum(0.0, 1.0 - error), axis=0), np.mean(error < 1.0, axis=0)
+        cells = [
+            f"{a:.3f}, {b:.3f} / {t:.0f}"
+            for a, b, t in zip(auc, below, np.median(ms, axis=0), strict=True)
+        ]
+        print(
+            f"| {path.stem}, {len(results)} pairs: AUC, below |", " | ".join(cells), "|", flush=True
+        )
+    for share in (0.0, 0.3, 0.5) if arguments.trials else ():
         trials = []
         for seed in range(arguments.trials):
             x1, x2, t1, t2 = simulated(share, seed)

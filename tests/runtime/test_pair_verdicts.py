@@ -69,6 +69,16 @@ class TestPlanes:
         assert batch.success[0] == single.success
         assert ("gross errors" in single.flags) == (wrong >= 10)
 
+    def test_heavy_tails_do_not_hide_a_plane_without_relief(self) -> None:
+        rng = np.random.default_rng(6)
+        x1, x2 = plane(300, 0, seed=6)
+        H = np.linalg.svd(rng.standard_normal((3, 3)))[0] * 0.02 + np.eye(3)
+        h = np.column_stack([x1 - 640.0, np.full(300, 1000.0)]) @ H.T
+        x2 = 1000.0 * h[:, :2] / h[:, 2:] + 0.03 * rng.standard_t(2.0, (300, 2))
+        result = eg.refine_fundamental(x1, x2)
+        assert {"planar scene", "still camera"} & set(result.flags)
+        assert not result.success
+
     @needs_a_front_end
     @pytest.mark.parametrize("wrong", [0, 2, 30])
     def test_nor_from_estimate(self, wrong) -> None:
@@ -121,6 +131,16 @@ class TestNothingInCommon:
             result = eg.refine_fundamental(x1, x2)
             assert "no common geometry" in result.flags
             assert not result.success
+
+    @pytest.mark.parametrize("m", [11, 13])
+    def test_few_random_matches_into_refine(self, m) -> None:
+        named = 0
+        for seed in range(10):
+            x1, x2 = np.random.default_rng(seed).uniform([0, 0], SIZE, (2, m, 2))
+            named += "no common geometry" in eg.refine_fundamental(x1, x2).flags
+            view = eg.two_view_scene(4.0, n_points=m, noise_px=0.5, seed=seed)
+            assert eg.refine_fundamental(view.x1, view.x2).success
+        assert named >= 7
 
     @needs_a_front_end
     @pytest.mark.parametrize("m", [20, 100])

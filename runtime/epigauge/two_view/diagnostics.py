@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.two_view.chance import SIGNIFICANT
 from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.essential import Calibrated
 from epigauge.two_view.evidence import ROUNDING, Evidence
@@ -51,6 +52,10 @@ _ENOUGH_OFF = 30
 _FEW_OFF_FLAT = 0.25
 _FLAT = 0.005
 
+#: A nearly planar scene with less relief than this share of the range, RMS (1 px in an image of
+#: 1000), is planar, whatever its significance: noise of photographs is not normal.
+_NO_RELIEF = 0.001
+
 #: Variance of the residuals of a homography over that of F, below which the geometric AIC prefers
 #: the homography (many matches); and the 99 % quantile of the normal distribution, for few.
 _AIC_RATIO = 1.5
@@ -85,7 +90,7 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     to no motion at all, and the noise s^2 = S / (n - p), the flags say
 
     - no common geometry: more geometries than `chance.SIGNIFICANT` says would agree so well with
-      wrong matches, with F and with the best other geometry;
+      wrong matches, with F and with the best other geometry; than one, of few matches;
     - gross errors: the geometry of highest likelihood under a mixture of right and wrong matches is
       no chance, leaves some far off, and the variance of those near it is less than half of s^2;
     - planar scene: ``S_H / (2 n - 8) <= max(1.5, F99) s^2``, with F99 the 99 % quantile of the
@@ -98,7 +103,8 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
       chance [2]_;
     - nearly planar: of the matches that agree with F at most a tenth, and fewer than 30, are more
       than 8 s from the homography that most are on, the others by one per cent of the range at
-      most, RMS; at most a quarter where all are within half a per cent, RMS;
+      most, RMS; at most a quarter where all are within half a per cent, RMS. With less relief than
+      a thousandth of the range, such a scene is planar;
     - still camera: planar, and ``S_I - S_H <= max(20.1, 0.1 n) s^2``; in place of the former;
     - pure rotation: planar, and ``|tr H - tr H^-1|`` (det H = 1) within three standard deviations
       of zero: H = K R K^-1 has the eigenvalues of a rotation whatever K. Of calibrated cameras,
@@ -130,10 +136,10 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
         if best.searched and is_common(best):
             judged = best
             raised["gross errors"] = is_inflated(found, judged)
-    few = raised["few matches"] and not found.searched  # too few to show anything: that is told
+    # So few cannot be significant; but no more geometries than one may agree by chance.
+    few = raised["few matches"] and not found.searched
     wide = found.noise > WIDE * RANGE
-    doubtful = judged.searched or (wide and not few)
-    if doubtful and not is_common(judged):
+    if (judged.searched or wide) and not is_common(judged, 0.0 if few else SIGNIFICANT):
         raised["no common geometry"] = True
     else:
         for name, is_raised in _plane(judged).items():
@@ -169,6 +175,7 @@ def _plane(found: Evidence) -> dict[str, bool]:
     share = _FEW_OFF_FLAT if model.mean <= (_FLAT * RANGE) ** 2 else _FEW_OFF
     few = model.far <= share * len(on) and model.far < _ENOUGH_OFF
     nearly = few and model.relief <= (RELIEF * RANGE) ** 2
+    explained = explained or (nearly and model.relief <= (_NO_RELIEF * RANGE) ** 2)
     q1, q2 = found.q1[:, on], found.q2[:, on]
     more = displacement(found, q1, q2, weights) - model.cost
     if found.from_rays is None:

@@ -90,8 +90,11 @@ def is_inflated(found: Evidence, judged: Evidence) -> bool:
     return found.noise**2 > _INFLATED * max(judged.noise, ROUNDING) ** 2
 
 
-def is_common(found: Evidence) -> bool:
-    """Tell whether more matches agree with F than wrong ones would by chance."""
+def is_common(found: Evidence, bar: float = SIGNIFICANT) -> bool:
+    """Tell whether more matches agree with F than wrong ones would by chance.
+
+    They would with 10 to the power `bar` geometries at most.
+    """
     limit = min(found.limit, CEILING * RANGE) if found.searched else found.limit
     near = found.squared <= limit**2
     m, agreed = len(found.inlier), int(np.count_nonzero(near))
@@ -99,4 +102,4 @@ def is_common(found: Evidence) -> bool:
         return False
     copies = agreed - independent(found.q1[:, near], found.q2[:, near])
     chance = chance_agreement(found.table, found.F, found.all1, found.all2, limit)
-    return log10_false_alarms(m - copies, agreed - copies, chance) <= SIGNIFICANT
+    return log10_false_alarms(m - copies, agreed - copies, chance) <= bar
