@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from epigauge import kernels
 from epigauge.bundle import null_space, numpy_linearizer
-from epigauge.bundle.solve import Blocks, Border, BundleSystem, Step, conjugate_gradients
+from epigauge.bundle.reduced import conjugate_gradients
+from epigauge.bundle.solve import Blocks, Border, BundleSystem, Step
 from epigauge.bundle.ties import Ties
 from epigauge.two_view.losses import Loss
 from laws import central_differences, distance

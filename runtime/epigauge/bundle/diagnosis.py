@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from epigauge.bundle.dampings import Covariant
 from epigauge.bundle.null_space import generators
-from epigauge.bundle.solve import Bordered, BundleSystem, Iterated, reduced_system
+from epigauge.bundle.reduced import Bordered, Iterated, reduced_system
+from epigauge.bundle.solve import BundleSystem
 from epigauge.bundle.ties import Ties, congruent
 from epigauge.kernels import Table
 

@@ -19,8 +19,9 @@ from epigauge.bundle.moves import best_conditioned
 from epigauge.bundle.null_space import generators
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.problem import BundleState, Estimate
+from epigauge.bundle.reduced import Bordered, Iterated, reduced_system
 from epigauge.bundle.run import bundle_problem
-from epigauge.bundle.solve import Bordered, BundleSystem, Iterated, reduced_system
+from epigauge.bundle.solve import BundleSystem
 from epigauge.cameras import AffineReconstruction, MetricReconstruction, camera_model
 from epigauge.kernels import Table
 from epigauge.multi_view.frame import Frame

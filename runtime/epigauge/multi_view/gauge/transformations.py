@@ -1,0 +1,230 @@
+"""Changes of basis and scales that move a reconstruction and change no image (B03 eq. 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge import kernels
+from epigauge._arguments import as_real
+from epigauge.bundle.similarity import Similarity
+from epigauge.cameras import AffineReconstruction, MetricReconstruction
+from epigauge.errors import ArgumentError
+from epigauge.multi_view.tracks import Reconstruction
+from epigauge.rotations import as_rotation
+
+__all__ = ["Gauge", "Transformation", "similarity", "transform"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Transformation:
+    """P_i <- camera_scales_i P_i T and Q_j <- point_scales_j T^-1 Q_j (B03 section 4.1).
+
+    Attributes
+    ----------
+    T : ndarray, shape (4, 4)
+        Invertible.
+    camera_scales, point_scales : ndarray, shape (n,), (m,)
+        gamma and alpha, none zero.
+    """
+
+    T: Array
+    camera_scales: Array
+    point_scales: Array
+
+    def apply(self, P: Array, Q: Array) -> tuple[Array, Array]:
+        """Move cameras and points.
+
+        Parameters
+        ----------
+        P : ndarray, shape (n, 3, 4)
+            Cameras.
+        Q : ndarray, shape (m, 4)
+            Points.
+
+        Returns
+        -------
+        P, Q : ndarray, shape (n, 3, 4), (m, 4)
+            The same geometry.
+        """
+        cameras = self.camera_scales[:, None, None] * (P @ self.T)
+        return cameras, self.point_scales[:, None] * np.linalg.solve(self.T, Q.T).T
+
+    def inverse(self) -> Transformation:
+        """Return the transformation back.
+
+        Returns
+        -------
+        Transformation
+            What undoes this one.
+        """
+        return Transformation(
+            np.asarray(np.linalg.inv(self.T)), 1.0 / self.camera_scales, 1.0 / self.point_scales
+        )
+
+    def blocks(self) -> tuple[Array, Array]:
+        """Return the blocks of T~ on its diagonal (B03 eq. 5).
+
+        Returns
+        -------
+        cameras, points : ndarray, shape (n, 12, 12), (m, 4, 4)
+            They act on vect(P_i) and on Q_j.
+        """
+        table, inverse = kernels.table("numpy"), np.linalg.inv(self.T)
+        cameras = table.camera_transformation(self.T[..., None], self.camera_scales)
+        points = table.point_transformation(inverse[..., None], self.point_scales)
+        return np.moveaxis(cameras, -1, 0), np.moveaxis(points, -1, 0)
+
+
+class Gauge(Protocol):
+    """A rule that chooses basis and scales."""
+
+    def transformation(self, P: Array, Q: Array) -> Transformation:
+        """Return what moves cameras and points into the gauge.
+
+        Parameters
+        ----------
+        P : ndarray, shape (n, 3, 4)
+            Cameras.
+        Q : ndarray, shape (m, 4)
+            Points.
+
+        Returns
+        -------
+        Transformation
+            For this reconstruction.
+        """
+
+
+def similarity(s: float, R: ArrayLike, t: ArrayLike) -> Similarity:
+    """Return the similarity X -> s R X + t.
+
+    Parameters
+    ----------
+    s : float
+        Scale, positive.
+    R : array_like, shape (3, 3)
+        Rotation.
+    t : array_like, shape (3,)
+        Translation.
+
+    Returns
+    -------
+    Similarity
+        For `transform`.
+
+    Raises
+    ------
+    ArgumentError
+        If the scale is not positive, R no rotation or t not finite.
+
+    Examples
+    --------
+    >>> import numpy as np, epigauge as eg
+    >>> eg.gauge.similarity(2.0, np.eye(3), [1.0, 0.0, 0.0]).positions(np.zeros((1, 3)))
+    array([[1., 0., 0.]])
+    """
+    scale = as_real("s", s, "a positive number")
+    if scale.ndim or not 0.0 < scale < np.inf:
+        raise ArgumentError("s", f"is {s!r:.60}", "a positive number")
+    rotation = as_rotation("R", R)
+    target = as_real("t", t, "three numbers")
+    if target.shape != (3,) or not np.isfinite(target).all():
+        raise ArgumentError("t", f"is {t!r:.60}", "three finite numbers")
+    return Similarity(float(scale), rotation, np.zeros(3), target)
+
+
+@overload
+def transform(reconstruction: MetricReconstruction, T: Similarity) -> MetricReconstruction: ...
+
+
+@overload
+def transform(reconstruction: AffineReconstruction, T: ArrayLike) -> AffineReconstruction: ...
+
+
+@overload
+def transform(
+    reconstruction: Reconstruction,
+    T: ArrayLike,
+    camera_scales: ArrayLike = 1.0,
+    point_scales: ArrayLike = 1.0,
+) -> Reconstruction: ...
+
+
+def transform(
+    reconstruction: Reconstruction | MetricReconstruction | AffineReconstruction,
+    T: ArrayLike | Similarity,
+    camera_scales: ArrayLike = 1.0,
+    point_scales: ArrayLike = 1.0,
+) -> Reconstruction | MetricReconstruction | AffineReconstruction:
+    """Apply a gauge transformation, which changes no projected point.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction, MetricReconstruction or AffineReconstruction
+        Cameras and points.
+    T : array_like, shape (4, 4), or Similarity
+        Change of basis, invertible, of an affine reconstruction with the last row 0 0 0 1; of a
+        metric reconstruction a `similarity`.
+    camera_scales, point_scales : array_like
+        Factors of each camera and point, or one for all; none zero. Of projective ones only.
+
+    Returns
+    -------
+    Reconstruction, MetricReconstruction or AffineReconstruction
+        P_i' = gamma_i P_i T, Q_j' = alpha_j T^-1 Q_j; or X' = s R X + t, and cameras that see it
+        as before.
+
+    Raises
+    ------
+    ArgumentError
+        If T is singular, a scale is zero, or T is of the other kind.
+    """
+    if isinstance(reconstruction, MetricReconstruction) or isinstance(T, Similarity):
+        kinds = isinstance(reconstruction, MetricReconstruction), isinstance(T, Similarity)
+        if not isinstance(reconstruction, MetricReconstruction) or not isinstance(T, Similarity):
+            what = "is a similarity" if kinds[1] else "is no similarity"
+            kind = "metric" if kinds[0] else "projective"
+            needed = "eg.gauge.similarity(s, R, t)" if kinds[0] else "a (4, 4) matrix"
+            raise ArgumentError("T", f"{what}, the reconstruction {kind}", needed)
+        _no_scales("metric", camera_scales, point_scales)
+        moved, X = T.apply(reconstruction.vectors, reconstruction.X)
+        pose = moved[:, :12].reshape(-1, 3, 4)
+        return MetricReconstruction(pose[:, :, :3], pose[:, :, 3], X, reconstruction.cameras)
+    matrix = as_real("T", T, "a finite (4, 4) matrix")
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ArgumentError("T", f"has shape {matrix.shape}", "a finite (4, 4) matrix")
+    if np.linalg.cond(matrix) > 1e15:
+        raise ArgumentError("T", "is singular", "an invertible (4, 4) matrix")
+    if isinstance(reconstruction, AffineReconstruction):
+        _no_scales("affine", camera_scales, point_scales)
+        if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+            raise ArgumentError("T", f"has the last row {matrix[3].tolist()}", "0 0 0 1")
+        there = np.asarray(np.linalg.solve(matrix[:3, :3], (reconstruction.X - matrix[:3, 3]).T)).T
+        return AffineReconstruction(reconstruction.P[:, :2] @ matrix, np.asarray(there))
+    scales = []
+    for name, value, count in (
+        ("camera_scales", camera_scales, len(reconstruction.P)),
+        ("point_scales", point_scales, len(reconstruction.Q)),
+    ):
+        array = as_real(name, value, f"a number or a ({count},) array")
+        if array.shape not in ((), (1,), (count,)):
+            raise ArgumentError(name, f"has shape {array.shape}", f"a number or ({count},)")
+        array = np.broadcast_to(array, (count,))
+        if not np.isfinite(array).all() or (array == 0.0).any():
+            raise ArgumentError(name, "has a zero or is not finite", "finite factors, none zero")
+        scales.append(array)
+    return Reconstruction(
+        *Transformation(matrix, *scales).apply(reconstruction.P, reconstruction.Q)
+    )
+
+
+def _no_scales(kind: str, camera_scales: ArrayLike, point_scales: ArrayLike) -> None:
+    for name, scales in (("camera_scales", camera_scales), ("point_scales", point_scales)):
+        if not np.array_equal(scales, 1.0):
+            raise ArgumentError(name, "is given", f"none for {kind} reconstructions")
