@@ -90,6 +90,18 @@ static void times(ptrdiff_t n, ptrdiff_t d, ptrdiff_t a, int turned, const doubl
         }
 }
 
+/* The same twice for blocks as large as a panel: X = left^T X right. */
+static void between(const double *left, const double *right, double *X)
+{
+    double turned[BLOCK], half[BLOCK] = {0.0};
+    for (int i = 0; i < ROWS; ++i)
+        for (int k = 0; k < ROWS; ++k)
+            turned[ROWS * k + i] = X[ROWS * i + k];
+    subtract_some(ROWS, right, turned, half); /* -X right, row by row */
+    memset(X, 0, sizeof half);
+    subtract_some(ROWS, half, left, X);
+}
+
 /* Whether all matrices (a, a) are diagonal. */
 static int diagonal(ptrdiff_t count, ptrdiff_t a, const double *A)
 {
@@ -119,7 +131,9 @@ void eg_skyline_reduce(
             for (ptrdiff_t i = 0; scaled && i < d; ++i)
                 for (ptrdiff_t k = 0; k < d; ++k)
                     X[d * i + k] *= left[(a + 1) * i] * right[(a + 1) * k];
-            if (A && !scaled) {
+            if (A && !scaled && a == ROWS && d == ROWS) {
+                between(left, right, X);
+            } else if (A && !scaled) {
                 times(d, d, a, 0, X, right, half);
                 times(a, d, a, 1, left, half, X);
             }
