@@ -489,6 +489,20 @@ def test_curved_valleys_of_weak_calibrations_are_followed_to_their_end(seed: int
     assert found.cost <= best.cost * (1.0 + 1e-6)
 
 
+def test_what_nothing_determines_is_named() -> None:
+    """Six coefficients of one radius: numerator and denominator exchange in a narrow view."""
+    params = [[1000.0, 1000.0, 320.0, 240.0, -0.1, 0.01, 1e-3, 1e-3, 1e-3, 2e-3, 3e-3, 1e-3]]
+    tracks, start = scene("FULL_OPENCV", params, m=40)
+    tracks = eg.Tracks(tracks.view, tracks.point, start.project(tracks))
+    found = eg.bundle_adjust(tracks, start)
+    assert found.flags == ("undetermined",)
+    assert found.weakest.endswith("(undetermined)")
+    named = {part.split(" of view")[0] for part in found.weakest.split(", ")}
+    assert named <= {f"k{k}" for k in range(1, 7)}
+    known = eg.bundle_adjust(tracks, start, refine=("f", "cx", "cy", "k1", "p1", "p2"))
+    assert "undetermined" not in known.flags
+
+
 def test_gauge_groups_are_those_of_the_cameras() -> None:
     tracks, start = scene()
     assert eg.gauge.group("SIMPLE_RADIAL").dimension == 7

@@ -47,12 +47,15 @@ class Diagnosis:
         cameras with unit diagonal blocks; NaN where the system is not factored.
     cameras : ndarray, shape (n, d)
         Own tangents of that weakest direction, one standard deviation long for a noise of one.
+    open : ndarray, shape (n, d), or None
+        A direction that nothing determines, as far as each entry moves images.
     """
 
     rank: int
     missing: int
     condition: float
     cameras: Array
+    open: Array | None = None
 
 
 def diagnosed(
@@ -103,13 +106,27 @@ def diagnosed(
     open_ = int(np.count_nonzero(values <= _ROUNDING))
     missing = max(open_ - gauge, 0)
     rank = unknowns - gauge - missing - of_points
-    first = max(open_, gauge)
+    first, found = max(open_, gauge), None
+    if missing:
+        x, s = X[: n * a, :open_].reshape(n, a, open_), X[n * a :, :open_]
+        found = _beside_gauge(system, kernels, ties.cameras(x, s))
     if first >= count:
-        return Diagnosis(rank, missing, float("inf"), nothing)
+        return Diagnosis(rank, missing, float("inf"), nothing, found)
     value = float(max(values[first], _ROUNDING))
     x, s = X[: n * a, first].reshape(n, a, 1), X[n * a :, first, None]
     weakest = ties.cameras(x, s)[..., 0] / np.sqrt(value)
-    return Diagnosis(rank, missing, 1.0 / value, weakest)
+    return Diagnosis(rank, missing, 1.0 / value, weakest, found)
+
+
+def _beside_gauge(system: BundleSystem, kernels: Table, own: Array) -> Array:
+    """Return of open directions (n, d, k) the one least of the gauge, as it moves images."""
+    size = np.sqrt(np.einsum("nii->ni", system.normal.U))[..., None]
+    moves = size * generators(system.model, kernels, system.cameras, system.points)[0]
+    basis = np.linalg.qr(moves.reshape(size.size, -1))[0]
+    across = (size * own).reshape(size.size, -1)
+    across = across / np.maximum(np.linalg.norm(across, axis=0), 1e-300)
+    across -= basis @ (basis.T @ across)
+    return np.asarray(np.linalg.svd(across, full_matrices=False)[0][:, 0].reshape(size.shape[:2]))
 
 
 def _factored(

@@ -81,6 +81,7 @@ class BundleResult:
     weakest : str
         Of metric and affine cameras the direction of that eigenvalue: its three largest standard
         deviations, as shares of a radian, of the scene's size, or of the focal length.
+        Where nothing determines a direction, what moves most along it.
     nfev, njev, nit, status, message, success, history
         As in `FundamentalResult`.
     """

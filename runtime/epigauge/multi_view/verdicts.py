@@ -234,6 +234,8 @@ def judged_metric(
         noise_px = np.sqrt(2.0 * outcome.state.cost / max(counted, 1))
         deviations = noise_px * np.abs(diagnosis.cameras)
         weakest, share = _named(system, deviations)
+        if diagnosis.open is not None:
+            weakest = f"{_largest(system, np.abs(diagnosis.open))} (undetermined)"
         flat = 0.0 if metric else _flatness(found, noise_px * Frame.of(tracks).scale)
         if diagnosis.missing or flat > 1.0:
             raised.append("undetermined")
@@ -273,6 +275,13 @@ def missing_beside(fixed: tuple[Array, Array]) -> int:
         rows.append(linear - np.outer(point, point @ linear))
     # E = I moves nothing.
     return 15 - int(np.linalg.matrix_rank(np.concatenate(rows), tol=1e-9))
+
+
+def _largest(system: BundleSystem, sizes: Array) -> str:
+    """Return the names of the three largest entries of own tangents (n, d)."""
+    views, entries = np.unravel_index(np.argsort(-sizes, axis=None)[:3], sizes.shape)
+    names = system.model.tangent_names
+    return ", ".join(f"{names[k]} of view {i}" for i, k in zip(views, entries, strict=True))
 
 
 def _named(system: BundleSystem, deviations: Array) -> tuple[str, float]:
