@@ -156,3 +156,8 @@ def test_the_projective_scene_shows_the_same() -> None:
     tracks, truth = scene()
     same = truth.to_projective()
     assert np.abs(same.project(tracks) - truth.project(tracks)).max() < 1e-10
+
+
+def test_covariances_of_affine_cameras_are_refused() -> None:
+    with pytest.raises(eg.ArgumentError, match="reconstruction is a AffineReconstruction"):
+        eg.covariance(*scene())  # type: ignore[call-overload]

@@ -323,6 +323,9 @@ def covariance(
     .. [1] K. Kanatani, D. D. Morris, "Gauges and gauge transformations for uncertainty description
        of geometric structure with indeterminacy", IEEE Trans. Inf. Theory 47(5), 2001.
     """
+    if not isinstance(reconstruction, Reconstruction | MetricReconstruction):
+        was = f"is a {type(reconstruction).__name__}"
+        raise ArgumentError("reconstruction", was, "an eg.Reconstruction or MetricReconstruction")
     if isinstance(reconstruction, MetricReconstruction):
         if loss != "linear":
             needed = "'linear'; give observations that were set aside weight zero"
