@@ -72,7 +72,7 @@ def main() -> int:
     sound: set[str] = set()
     for number, fault in enumerate(faults, 1):
         text = (scratch.path / fault.file).read_text()
-        row = done.get((fault.file, *fault.lines(text)))
+        row = done.get((fault.file, *fault.lines(text), _before(fault, text)))
         if row is None:
             row = _noticed(scratch, fault, text, reach, sound)
             with results.open("a") as file:
@@ -157,6 +157,7 @@ def _tried(scratch: Scratch, fault: Fault, text: str, reach: Reach) -> dict[str,
         "line": text.count("\n", 0, fault.begin) + 1,
         "old": old,
         "new": new,
+        "before": _before(fault, text),
     }
     try:
         scratch.write(fault.file, fault.planted(text))
@@ -231,7 +232,12 @@ def _done(results: Path) -> dict[tuple[object, ...], dict[str, object]]:
     if not results.exists():
         return {}
     rows = [json.loads(line) for line in results.read_text().splitlines()]
-    return {(row["file"], row["old"], row["new"]): row for row in rows}
+    return {(row["file"], row["old"], row["new"], row.get("before", 0)): row for row in rows}
+
+
+def _before(fault: Fault, text: str) -> int:
+    """Return how often the line of a fault stands above it: a name that other changes leave."""
+    return text.count(fault.lines(text)[0], 0, text.rfind("\n", 0, fault.begin) + 1)
 
 
 if __name__ == "__main__":

@@ -188,3 +188,15 @@ def test_rows_tell_the_time():
     seconds = [row.seconds for row in history]
     assert seconds == sorted(seconds)
     assert 0.0 <= seconds[0] < seconds[-1] < time.perf_counter() - begun
+
+
+def test_distances_are_those_of_the_result_where_the_last_step_is_rejected():
+    rejected = 0
+    for seed in range(4):
+        scene = two_view_scene(16.0, n_points=30, noise_px=2.0, seed=seed)
+        for steps in range(1, 12):
+            result = eg.refine_fundamental(scene.x1, scene.x2, max_iter=steps, backend="c")
+            rejected += not result.history[-1].accepted
+            d, _, _ = eg.reprojection_distances(result.F, scene.x1, scene.x2)
+            np.testing.assert_allclose(np.abs(result.fun), np.abs(d), atol=1e-6)
+    assert rejected >= 4
