@@ -14,7 +14,8 @@ pytest.importorskip("typer", reason="the command line needs typer")
 pytest.importorskip("rich", reason="the command line needs rich")
 
 from epigauge.__main__ import main
-from epigauge.reproduce.gauges_metric import LABELS
+from epigauge.bundle.run import PROJECTIVE_ONLY
+from epigauge.bundle.strategies import STRATEGIES
 from metric_scenes import metric_scene
 
 
@@ -125,7 +126,7 @@ def test_pictures_show_the_scene_in_its_own_shape(run, folder, tmp_path) -> None
         (("--fix-view", "4"), "0 to 3"),
         (("--refine", "focal"), "names 'focal'"),
         (("-o", "nowhere/o"), "nowhere"),
-        (("-o", "o.txt"), "'bal'"),
+        (("-o", "o.txt"), "colmap_to_bal"),
         (("--rigs", "bent", "-o", "o"), "rigs is 'bent'"),
     ],
 )
@@ -155,7 +156,7 @@ def test_compare_puts_methods_side_by_side(run, folder) -> None:
     assert [row["cost"] for row in found["rows"]] == [wanted.cost]
     code, out, _ = run("compare", folder, "--max-iter", "1", "--json")
     methods = [row["method"] for row in json.loads(out)["rows"]]
-    assert methods == list(LABELS)
+    assert methods == [name for name in STRATEGIES if name not in PROJECTIVE_ONLY]
 
 
 def test_rigs_are_given_up_only_on_request(run, tmp_path) -> None:
