@@ -19,6 +19,7 @@ SCRIPTS = {
     "two_views.py": ["--quick"],
     "kernels.py": ["--quick"],
     "many_views.py": ["--quick"],
+    "metric_views.py": ["--runs", "1"],
     "sequences.py": ["--quick"],
     "imports.py": ["--runs", "3"],
 }
@@ -28,6 +29,7 @@ TABLES: dict[str, list[str]] = {
     "two_views.py": [],
     "kernels.py": [],
     "many_views.py": ["--plot", "growth.png"],
+    "metric_views.py": [],
     "sequences.py": [],
     "imports.py": [],
 }

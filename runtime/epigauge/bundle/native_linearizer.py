@@ -72,7 +72,8 @@ class NativeLinearizer:
         Entries of a camera's tangent that are computed with; all others count as known: their rows
         in the normal equations are zero. By default all.
     factored : bool, optional
-        Whether projective cameras go by their factors; by default they do.
+        Whether cameras of homogeneous points, whose tangent is their matrix, go by the factors of
+        their Jacobian; by default they do.
     """
 
     def __init__(
@@ -88,7 +89,7 @@ class NativeLinearizer:
     ) -> None:
         self.model, self.graph, self.loss = model, graph, loss
         self.q, self.weights = q, weights
-        by_factors = model.name == "projective" if factored is None else factored
+        by_factors = model.homogeneous if factored is None else factored
         row = FACTORED if by_factors else function("camera_model_row")(model.prefix.encode())
         whole = np.arange(model.tangent_size)
         used = whole if columns is None or by_factors else np.unique(np.asarray(columns, np.intp))
