@@ -52,10 +52,6 @@ _ENOUGH_OFF = 30
 _FEW_OFF_FLAT = 0.25
 _FLAT = 0.005
 
-#: A nearly planar scene with less relief than this share of the range, RMS (1 px in an image of
-#: 1000), is planar, whatever its significance: noise of photographs is not normal.
-_NO_RELIEF = 0.001
-
 #: Variance of the residuals of a homography over that of F, below which the geometric AIC prefers
 #: the homography (many matches); and the 99 % quantile of the normal distribution, for few.
 _AIC_RATIO = 1.5
@@ -103,8 +99,8 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
       chance [2]_;
     - nearly planar: of the matches that agree with F at most a tenth, and fewer than 30, are more
       than 8 s from the homography that most are on, the others by one per cent of the range at
-      most, RMS; at most a quarter where all are within half a per cent, RMS. With less relief than
-      a thousandth of the range, such a scene is planar;
+      most, RMS; at most a quarter where all are within half a per cent, RMS. Such a scene
+      is planar where all are within a thousandth, RMS, but for those that agree by chance;
     - still camera: planar, and ``S_I - S_H <= max(20.1, 0.1 n) s^2``; in place of the former;
     - pure rotation: planar, and ``|tr H - tr H^-1|`` (det H = 1) within three standard deviations
       of zero: H = K R K^-1 has the eigenvalues of a rotation whatever K. Of calibrated cameras,
@@ -175,7 +171,7 @@ def _plane(found: Evidence) -> dict[str, bool]:
     share = _FEW_OFF_FLAT if model.mean <= (_FLAT * RANGE) ** 2 else _FEW_OFF
     few = model.far <= share * len(on) and model.far < _ENOUGH_OFF
     nearly = few and model.relief <= (RELIEF * RANGE) ** 2
-    explained = explained or (nearly and model.relief <= (_NO_RELIEF * RANGE) ** 2)
+    explained = explained or (nearly and model.flat)
     q1, q2 = found.q1[:, on], found.q2[:, on]
     more = displacement(found, q1, q2, weights) - model.cost
     if found.from_rays is None:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.two_view.chance import chance_agreement
+from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.evidence import ROUNDING, WITHIN, Evidence
 from epigauge.two_view.homography import fit_homography, robust_homography
 
@@ -55,6 +56,11 @@ MOST_ON = 0.7
 RELIEF = 0.01
 HIDDEN = RELIEF / 2.0**0.5
 
+#: Less than this share of the range, RMS, is no relief (1 px in an image of 1000), whatever the
+#: noise: that of photographs is not normal. Matches off by three times as much stand out.
+_NO_RELIEF = 0.001
+_STANDS_OUT = 3.0
+
 #: Wrong matches that the epipole can be put through when all others are in one plane.
 _EPIPOLE = 2
 
@@ -67,6 +73,8 @@ class Planes:
     ----------
     far : int
         Matches far off the homography that most are on.
+    flat : bool
+        Whether all have next to no relief, but for those that agree with F by chance.
     relief, mean : float
         Mean of the squared distances to it; with far matches as if they were just so far off.
     on : ndarray of bool, shape (n,)
@@ -80,6 +88,7 @@ class Planes:
     """
 
     far: int
+    flat: bool
     relief: float
     mean: float
     on: Mask
@@ -149,18 +158,21 @@ def judge_plane(found: Evidence, *, hidden: bool) -> Planes:
     """
     noise2 = max(found.noise, ROUNDING) ** 2
     far, relief, mean, on = 0, 0.0, 0.0, np.ones(len(found.weights), np.bool_)
+    flat = False
     if not hidden:
         _, squares = robust_homography(found.q1, found.q2, found.weights, found.table)
         squares = found.weights * squares
         far = int(np.count_nonzero(squares > FAR_OFF**2 * noise2))
         relief = float(np.mean(np.minimum(squares, FAR_OFF**2 * noise2)))
         mean = float(np.mean(squares))
+        flat = _is_flat(found, squares)
         on = _without_chance(found, squares <= OFF_PLANE**2 * noise2)
     weights = found.weights[on]
     q1, q2 = (np.ascontiguousarray(q[:, on]) for q in (found.q1, found.q2))
     H, squares, normal = fit_homography(q1, q2, weights, found.table)
     return Planes(
         far=far,
+        flat=flat,
         relief=relief,
         mean=mean,
         on=on,
@@ -185,13 +197,26 @@ def _without_chance(found: Evidence, on: Mask) -> Mask:
     epipolar lines. A few such matches would hide that all the rest are in one plane.
     """
     off = len(on) - int(np.count_nonzero(on))
+    return on if _is_accidental(found, off) else np.ones(len(on), np.bool_)
+
+
+def _is_accidental(found: Evidence, off: int) -> bool:
+    """Tell whether no more matches are off a plane than agree with F by chance."""
     if off <= _EPIPOLE:
-        return on
-    if found.searched:
-        chance = chance_agreement(found.table, found.F, found.all1, found.all2, found.limit)
-        if off <= _by_chance(found.rejected + off, chance):
-            return on
-    return np.ones(len(on), np.bool_)
+        return True
+    if not found.searched:
+        return False
+    chance = chance_agreement(found.table, found.F, found.all1, found.all2, found.limit)
+    return off <= _by_chance(found.rejected + off, chance)
+
+
+def _is_flat(found: Evidence, squares: Array) -> bool:
+    """Tell whether all are on the plane by any measure, but for those that agree by chance."""
+    bound = (_NO_RELIEF * RANGE) ** 2
+    off = squares > _STANDS_OUT**2 * bound
+    if off.all() or np.mean(squares[~off]) > bound:
+        return False
+    return _is_accidental(found, int(np.count_nonzero(off)))
 
 
 def _by_chance(wrong: int, chance: float) -> int:
