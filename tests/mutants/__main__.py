@@ -182,7 +182,7 @@ def _stages(root: Path, fault: Fault, text: str, reach: Reach) -> list[list[str]
     here = area(fault.file)
     whole = [f"tests/{name}" for name in here["tests"]]
     if fault.file.endswith(".py") and (lines := _statement(fault, text)):
-        tests = reach.of_lines(fault.file, lines)
+        tests = reach.of_lines(fault.file, lines) or reach.of_file(fault.file)
     else:  # what is done at import, or in C
         tests = {test for test in reach.seconds if test.split("::")[0] in whole}
         for module in here.get("through", [fault.file]):
@@ -191,7 +191,8 @@ def _stages(root: Path, fault: Fault, text: str, reach: Reach) -> list[list[str]
         return [[name] for name in whole if (root / name).exists()]
 
     def price(test: str) -> float:
-        return reach.seconds[test] * (1.0 if test.split("::")[0] in whole else _FAR)
+        near = 1.0 if test.split("::")[0] in whole else _FAR
+        return reach.seconds[test] * reach.breadth.get(test, 1) * near  # small ones aim best
 
     stages: list[list[str]] = [[] for _ in _STAGES]
     total = 0.0
@@ -215,6 +216,7 @@ def _statement(fault: Fault, text: str) -> list[str]:
 
     def visit(node: ast.AST, inside: bool) -> None:
         nonlocal found
+        inside = inside or isinstance(node, ast.FunctionDef)
         for child in ast.iter_child_nodes(node):
             if isinstance(child, ast.stmt):
                 body = getattr(child, "body", None)
@@ -222,10 +224,11 @@ def _statement(fault: Fault, text: str) -> list[str]:
                 if inside and child.lineno <= first and last <= max(end, child.lineno):
                     function = isinstance(child, ast.FunctionDef | ast.ClassDef)
                     found = [] if function else lines[child.lineno - 1 : max(end, child.lineno)]
-            visit(child, inside or isinstance(node, ast.FunctionDef))
+            visit(child, inside)
 
     visit(ast.parse(text), False)
-    return found
+    alone = [line for line in found if text.count(line) == 1]
+    return alone or found
 
 
 def _done(results: Path) -> dict[tuple[object, ...], dict[str, object]]:

@@ -27,12 +27,15 @@ class Reach:
     ----------
     seconds : dict of str to float
         How long each test takes; only those that pass without any fault.
+    breadth : dict of str to int
+        How many lines of the library each test runs.
     broken : list of str
         Tests that fail without any fault; they would notice everything.
     """
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
+        self.breadth: dict[str, int] = {}
         self.broken: list[str] = []
         self._lines: dict[str, dict[str, set[str]]] = {}
 
@@ -47,6 +50,8 @@ class Reach:
         for file, lines in record["lines"].items():
             mine = self._lines.setdefault(file, {})
             for text, tests in lines.items():
+                for k in tests:
+                    self.breadth[names[k]] = self.breadth.get(names[k], 0) + 1
                 mine.setdefault(text, set()).update(names[k] for k in tests)
 
     def of_lines(self, file: str, lines: Sequence[str]) -> set[str]:
