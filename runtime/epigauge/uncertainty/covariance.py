@@ -110,15 +110,48 @@ class MetricCovariance:
         return replace(self, gauge=gauge, _projection=there)
 
     def camera(self, i: int) -> Array:
-        """Return the covariance of rotation and centre of view i, shape (6, 6)."""
+        """Return the covariance of the small rotation and the centre of a view.
+
+        Parameters
+        ----------
+        i : int
+            View.
+
+        Returns
+        -------
+        ndarray, shape (6, 6)
+            Radians about the axes of the scene, and the unit of the scene.
+        """
         return self.between(("camera", i), ("camera", i))
 
     def intrinsics(self, c: int) -> Array:
-        """Return the covariance of the adjustable parameters of camera c, shape (k, k)."""
+        """Return the covariance of the adjustable parameters of a camera.
+
+        Parameters
+        ----------
+        c : int
+            Row of `Cameras.params`.
+
+        Returns
+        -------
+        ndarray, shape (k, k)
+            Zero where a parameter is not refined.
+        """
         return self.between(("intrinsics", c), ("intrinsics", c))
 
     def point(self, j: int) -> Array:
-        """Return the covariance of point j, shape (3, 3)."""
+        """Return the covariance of a point.
+
+        Parameters
+        ----------
+        j : int
+            Point.
+
+        Returns
+        -------
+        ndarray, shape (3, 3)
+            In the unit of the scene.
+        """
         return self.between(("point", j), ("point", j))
 
     def between(self, a: tuple[str, int], b: tuple[str, int]) -> Array:
