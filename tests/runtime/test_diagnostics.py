@@ -5,8 +5,11 @@ from __future__ import annotations
 import epigauge as eg
 import numpy as np
 import pytest
-from epigauge.two_view.diagnostics import _variance_ratio_99
+from epigauge.two_view import minima
+from epigauge.two_view.diagnostics import _variance_ratio_99, planar_bound
+from epigauge.two_view.evidence import evidence
 from epigauge.two_view.homography import fit_homography
+from epigauge.two_view.suspicion import is_suspicious
 from epigauge.verdicts import FLAGS
 from two_views import algebraic, homogeneous, inliers, scene
 
@@ -142,3 +145,60 @@ class TestParts:
         assert result.flags
         assert set(result.flags) <= set(FLAGS)
         assert result.flags == tuple(flag for flag in FLAGS if flag in result.flags)
+
+
+def test_the_bound_of_a_plane_is_fishers_quantile_by_its_degrees_of_freedom() -> None:
+    stats = pytest.importorskip("scipy.stats")
+    for n in (12, 25, 60, 400):
+        for parameters in (5, 7):
+            # A homography leaves 2 n - 8 degrees of freedom, F leaves n - parameters.
+            exact = stats.f.ppf(0.99, 2 * n - 8, n - parameters)
+            least = planar_bound(10**7, 7) / (2e7 - 8)
+            expected = (2 * n - 8) * max(exact, least)
+            assert planar_bound(n, parameters) == pytest.approx(expected, rel=0.1)
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+def test_flags_do_not_ask_for_the_unit_of_length(loss: str) -> None:
+    """Pixels, or units of ten of them: with the scale of the loss alike, the same verdict."""
+    rng = np.random.default_rng(5)
+    for kind in ("general", "planar"):
+        x1, x2 = scene(kind, 120, 1.0, rng)
+        x2[:12] += rng.uniform(-60.0, 60.0, (12, 2))
+        results = [
+            eg.refine_fundamental(s * x1, s * x2, loss=loss, loss_scale_px=2.0 * s)
+            for s in (1.0, 10.0, 0.1)
+        ]
+        for found in results[1:]:
+            assert set(found.flags) - {"not pixels"} == set(results[0].flags)
+        assert ("planar scene" in results[0].flags) == (kind == "planar")
+
+
+@pytest.fixture
+def evidences(monkeypatch: pytest.MonkeyPatch) -> list:
+    """What the diagnosis is shown, and pixels a unit."""
+    seen = []
+
+    def recorded(matches, *rest):
+        seen.append((evidence(matches, *rest), matches.frame.scale))
+        return seen[-1][0]
+
+    monkeypatch.setattr(minima, "evidence", recorded)
+    return seen
+
+
+def test_the_diagnosis_is_shown_the_noise_that_a_loss_leaves(evidences) -> None:
+    x1, x2 = scene("general", 200, 0.5, np.random.default_rng(3))
+    x2[:20] += np.random.default_rng(4).uniform(-60.0, 60.0, (20, 2))
+    eg.refine_fundamental(x1, x2, loss="huber", loss_scale_px=0.7)
+    found, scale = evidences[-1]
+    assert found.noise * scale == pytest.approx(0.5, rel=0.25)
+    assert 10 <= found.rejected <= 25
+
+
+def test_one_match_far_beyond_the_noise_is_suspicious(evidences) -> None:
+    for off, expected in ((0.0, False), (8.0, True)):
+        x1, x2 = scene("general", 100, 0.1, np.random.default_rng(4))
+        x2[0] += off
+        eg.refine_fundamental(x1, x2, backend="numpy")
+        assert is_suspicious(evidences[-1][0]) == expected

@@ -299,3 +299,24 @@ class TestSingularPlaces:
         # Entry (3, 3) cannot move: rank two forbids it. All others can.
         assert covariance[8, 8] == 0.0
         assert np.isinf(np.diag(covariance)[:8]).all()
+
+
+def test_the_deviation_of_sigma_is_that_of_the_singular_values_of_F() -> None:
+    """Away from 1, by differences: sigma = s2 / s1 of F as its nine entries vary."""
+    for seed in range(3):
+        scene = eg.two_view_scene(distance=3.0, n_points=80, noise_px=0.02, seed=seed)
+        flat = scene.x2 * [1.0, 0.5]  # pixels that are not square: sigma is not 1
+        result = eg.refine_fundamental(scene.x1, flat, noise_px=0.02)
+        assert result.sigma < 1.0 - 20.0 * result.sigma_std
+
+        def sigma(F: np.ndarray) -> float:
+            s = np.linalg.svd(F, compute_uv=False)
+            return float(s[1] / s[0])
+
+        steps = 1e-6 * np.abs(result.F).ravel()
+        slope = [
+            (sigma(result.F + E.reshape(3, 3)) - sigma(result.F - E.reshape(3, 3))) / (2.0 * h)
+            for h, E in zip(steps, np.diag(steps), strict=True)
+        ]
+        expected = np.sqrt(slope @ result.covariance @ slope)
+        assert result.sigma_std == pytest.approx(expected, rel=1e-3)
