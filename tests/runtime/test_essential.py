@@ -132,6 +132,14 @@ class TestCheirality:
 
 
 class TestNarrowFieldsOfView:
+    @pytest.mark.parametrize("t", [(0.0, 0.0, 0.05), (0.0, 0.0, -0.05), (0.03, 0.04, 0.0)])
+    def test_any_motion_of_rounded_matches_is_solved(self, t) -> None:
+        # Symmetric points: five of them may have a double root, whose equations are singular
+        for seed in range(4):
+            result = eg.refine_fundamental(*tele(seed, t), essential=True, K1=K_TELE)
+            assert result.status > 0
+            assert result.rms_px < 0.02
+
     @pytest.mark.parametrize("t", [(0.034, -0.0131, -0.0355), (0.05, 0.0, 0.0), (0.0, 0.02, 0.03)])
     @pytest.mark.parametrize("seed", range(5))
     def test_converges_to_the_best(self, seed, t) -> None:

@@ -29,6 +29,9 @@ _REAL = 1e-6
 #: Gauss-Newton steps on the ten equations of a root: digits that eigenvectors lose.
 _POLISH = 1
 
+#: Share of the trace that is added to the diagonal of their normal equations.
+_RIDGE = 1e-13
+
 #: Subsets of five that starts are taken from, matches that judge them; starts differ by more than
 #: this (unit norm, conditioned). Of the solutions, so many times the number of starts are looked at
 #: closely; with eight matches, the linear estimate is one of them.
@@ -129,6 +132,9 @@ def _polished(weights: Array, null: Array) -> Array:
         J = np.stack(columns, axis=2)
         # The scale of E is free: its direction is filled up
         normal = np.swapaxes(J, 1, 2) @ J + weights[:, :, None] * weights[:, None]
+        # At a double root J^T J is singular: a ridge that does not move where the steps end
+        ridge = _RIDGE * np.einsum("nii->n", normal)
+        normal = normal + ridge[:, None, None] * np.eye(4)
         right = np.einsum("nij,ni->nj", J, value)
         weights = weights - np.linalg.solve(normal, right[:, :, None])[:, :, 0]
     return np.asarray(E)
