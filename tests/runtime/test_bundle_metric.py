@@ -190,7 +190,8 @@ def test_noise_weighs_observations_against_priors(case: str) -> None:
 
     options = {**options, "priors": [scaled(prior) for prior in options["priors"]]}
     expected = eg.bundle_adjust(tracks, start, **options, ftol=1e-14)
-    assert distance(found.reconstruction.X, expected.reconstruction.X) < 1e-9
+    # Where steps no longer lower the cost, rounding decides: the square root of its digits
+    assert distance(found.reconstruction.X, expected.reconstruction.X) < 1e-7
     assert found.cost == pytest.approx(expected.cost, rel=1e-10)
 
 

@@ -111,6 +111,7 @@ ROWS = {
             "b": (np.arange(1.0, 21.0), "px"),
         },
     ),
+    "initialize_affine": Row(lambda **k: eg.initialize_affine(eg.Tracks(**k)), _TRACKS),
     "initialize": Row(lambda **k: eg.initialize(eg.Tracks(**k)), _TRACKS),
     "interop.from_colmap": Row(
         eg.interop.from_colmap,
@@ -167,6 +168,7 @@ NO_ARRAYS = {
     "gauge.group": "takes a name",
     "gauge.similarity": "refused forms are tested with the scenes that it moves",
     **dict.fromkeys(("multi_view_scene", "two_view_scene"), "takes numbers"),
+    **dict.fromkeys(("interop.bal_to_colmap", "interop.colmap_to_bal"), "takes a reconstruction"),
     "interop.from_opencv": "takes objects of OpenCV",
     "interop.from_poselib": "takes objects of PoseLib",
     "interop.from_two_view_geometry": "takes objects of pycolmap",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 
 import epigauge as eg
@@ -317,3 +318,24 @@ class TestPlanesWithWrongMatches:
 
     def test_number_by_chance_grows_with_wrong_matches_and_chance(self) -> None:
         assert _by_chance(30, 0.005) < _by_chance(300, 0.005) < _by_chance(300, 0.05) < 300
+
+
+@front_end
+@pytest.mark.parametrize("essential", [False, True])
+def test_hostile_matches_end_with_a_verdict_or_a_named_argument(essential: bool) -> None:
+    """Points on a line or a grid, far and near, whole numbers, some in the wrong order."""
+    options = {"essential": True, "K1": np.diag([500.0, 500.0, 1.0])} if essential else {}
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        m = int(rng.integers(8, 16))
+        X = np.column_stack([rng.integers(-3, 4, (m, 2)) * 0.1, rng.choice([2.0, 1e3, 1e6], m)])
+        if seed % 4 == 0:
+            X[:, 0] = 0.0
+        move = rng.choice([0.0, 0.05, -0.3, 1.0], 3)
+        x1, x2 = (500.0 * Y[:, :2] / Y[:, 2:] for Y in (X, X + move))
+        if seed % 2:
+            x1, x2 = np.round(x1), np.round(x2)
+        if seed % 3 == 0:
+            x1[m // 2 :] = x1[m // 2 :][::-1]
+        with contextlib.suppress(eg.ArgumentError):
+            assert np.isfinite(eg.estimate_fundamental(x1, x2, **options).F).all()

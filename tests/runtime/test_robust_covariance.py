@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import epigauge as eg
 import many_views
 import numpy as np
@@ -145,6 +147,10 @@ class TestNoise:
             assert untruncated(within, limit * sigma) == pytest.approx(sigma, rel=1e-3)
         assert untruncated(0.0, 1.0) == 0.0
 
+    @pytest.mark.skipif(
+        all(find_spec(name) is None for name in ("poselib", "cv2")),
+        reason="neither PoseLib nor OpenCV is installed",
+    )
     def test_an_estimate_gives_back_the_tails_that_its_threshold_cuts_off(self) -> None:
         x1, x2 = disturbed(np.random.default_rng(2), 0.15, 60.0)
         found = eg.estimate_fundamental(x1, x2)

@@ -126,15 +126,18 @@ class Consensus:
     def judge(self, F: Array, sigma: float, share: float = 0.5) -> Agreement:
         """Return the agreement with F, sigma and share being fitted from the values given."""
         signed = self.criterion.evaluate(F).signed
-        oriented = self.oriented(F)
-        squared = signed**2
+        # A match without a distance (beside a degenerate F) agrees with nothing.
+        there = np.abs(signed) < 1.0 / _FLOOR
+        oriented = self.oriented(F) & there
+        squared = np.where(there, signed, 0.0) ** 2
         best = None
         while True:
             mixture = Mixture.of(sigma, share, RANGE)
             wrong = np.log((1.0 - share) / RANGE)
             logs = np.where(oriented, mixture.logarithm(squared), wrong)
             score = float(np.sum(logs)) - 7.0 * float(np.log(RANGE / sigma))
-            if best is not None and score <= best.score + _CLIMBED:
+            # An F that has no distances (NaN) climbs no further.
+            if best is not None and not score > best.score + _CLIMBED:
                 return best
             best = Agreement(F, signed, oriented, sigma, share, score)
             right = np.where(oriented, mixture(squared)[1], 0.0)
@@ -160,7 +163,7 @@ class Consensus:
                 problem, self.chart.start(best.F), Levenberg(), lm.Classic(), stopping
             )
             trial = self.judge(found.state.F, best.sigma, best.share)
-            if trial.score <= best.score + _CLIMBED:
+            if not trial.score > best.score + _CLIMBED:
                 break
             best = trial
         return best

@@ -152,7 +152,7 @@ class Reprojection:
         if not np.trace(N) < _SINGULAR and weight.any():
             rows = self.corrected(distances)[2]
             smooth = np.sum(rows**2, axis=0) < _SINGULAR
-            if not smooth.all():
+            if (weight * ~smooth).any():
                 rest = None if curvature is None else curvature * smooth
                 return self.normal(F, distances, weight * smooth, rest)
         turn = np.kron(_padded(distances.frame[1]), _padded(distances.frame[0]))

@@ -209,7 +209,8 @@ class Calibrated:
         aa, bb = aa + depth**2, bb + depth**2
         c1, c2 = c[..., 0, :], c[..., 1, :]
         determinant = np.maximum(aa * bb - ab**2, np.finfo(float).tiny)
-        return np.asarray((bb * c1**2 - 2.0 * ab * c1 * c2 + aa * c2**2) / determinant)
+        with np.errstate(over="ignore"):  # a point that is mapped to infinity is infinitely far
+            return np.asarray((bb * c1**2 - 2.0 * ab * c1 * c2 + aa * c2**2) / determinant)
 
     def from_rotation(self, weights: Array) -> Array:
         """Return squared distances to the best q2 ~ R q1: those of a camera that only turned.

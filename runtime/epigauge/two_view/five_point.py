@@ -172,13 +172,16 @@ def essential_starts(
     E, _ = essential_5point(rays1[sets], rays2[sets])
     if len(counts) >= _LINEAR_LEAST:
         E = np.concatenate([E, _linear(rays1, rays2)[None]])
+    if not len(E):
+        return []  # all subsets degenerate, and too few for the linear start
     F = few.fundamental(E)
     squared = _sampson(F, few.q1, few.q2)
     scale2 = max(float(np.min(np.median(squared, axis=1))), np.finfo(float).tiny)
 
     def cost(squared: Array) -> Array:
         if robust:
-            return np.asarray(np.sum(np.log1p(squared / scale2), axis=1))
+            with np.errstate(over="ignore"):  # beside a start that fits exactly
+                return np.asarray(np.sum(np.log1p(squared / scale2), axis=1))
         return log_cost(np.sum(squared, axis=1), len(counts))
 
     # Sampson's distances, and depths of the matches as measured, are good enough to choose starts

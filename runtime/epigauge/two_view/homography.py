@@ -96,7 +96,8 @@ def _reweighted(
         middle = _middle(squares)
         if abs(middle - last) <= _STANDS * middle:
             break
-        own, last = weights / (1.0 + squares / middle) ** 2, middle
+        with np.errstate(over="ignore"):  # infinitely far: no weight
+            own, last = weights / (1.0 + squares / middle) ** 2, middle
     return H, squares
 
 
@@ -115,7 +116,8 @@ def _near_a_sample(table: Table, q1: Array, q2: Array, weights: Array) -> Array:
     candidates = np.linalg.svd(_equations(q1[:, four], q2[:, four]))[2][:, 8].reshape(-1, 3, 3)
     tried = [table.homography_squared(H, q1, q2) for H in candidates]
     best = min(tried, key=median)
-    return np.asarray(weights / (1.0 + best / _middle(best)) ** 2)
+    with np.errstate(over="ignore"):
+        return np.asarray(weights / (1.0 + best / _middle(best)) ** 2)
 
 
 def _middle(squares: Array) -> float:
