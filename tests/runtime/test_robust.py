@@ -339,3 +339,15 @@ def test_hostile_matches_end_with_a_verdict_or_a_named_argument(essential: bool)
             x1[m // 2 :] = x1[m // 2 :][::-1]
         with contextlib.suppress(eg.ArgumentError):
             assert np.isfinite(eg.estimate_fundamental(x1, x2, **options).F).all()
+
+
+@front_end
+def test_a_geometry_without_distances_ends_the_search() -> None:
+    # Forward motion over a grid: an F whose epipoles lie on matches has no distance there (NaN).
+    xy = [-3, 2, 0, 1, -2, 0, -2, -3, 3, 3, 3, 0, 1, 2, -3, 1, 3, -3, 2, -2, -1, -3, 0, 0]
+    z = np.array([2.0, 1.0, 1.0, 2.0, 1.0, 1.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.0])[:, None]
+    X = np.array(xy, np.float64).reshape(-1, 2) / 10.0
+    for unit in (11365.0, 1000.0):
+        result = eg.estimate_fundamental(unit * X / z + 320.0, unit * X / (z + 0.05) + 320.0)
+        assert np.isfinite(result.F).all()
+        assert "few matches" in result.flags
