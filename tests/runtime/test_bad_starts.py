@@ -90,6 +90,8 @@ class TestLambdaFloor:
         assert lams.min() == pytest.approx(dampings.LAM_FLOOR * lams[0], rel=1e-9)
 
     def test_without_the_floor_they_would_not(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        if eg.backend() != "c":
+            pytest.skip("the rounding that decides is that of the compiled evaluation")
         monkeypatch.setattr(dampings.Covariant, "lam_floor", 0.0)
         runs = self.runs()
         lams = np.array([row.lam for run in runs for row in run.history[1:]])
