@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import epigauge as eg
 import numpy as np
 import pytest
 from epigauge.two_view import minima
-from epigauge.two_view.diagnostics import _variance_ratio_99, planar_bound
+from epigauge.two_view.diagnostics import _variance_ratio_99, diagnose, planar_bound
 from epigauge.two_view.evidence import evidence
 from epigauge.two_view.homography import fit_homography
 from epigauge.two_view.suspicion import is_suspicious
@@ -202,3 +204,10 @@ def test_one_match_far_beyond_the_noise_is_suspicious(evidences) -> None:
         x2[0] += off
         eg.refine_fundamental(x1, x2, backend="numpy")
         assert is_suspicious(evidences[-1][0]) == expected
+
+
+def test_a_run_that_did_not_begin_has_flags(evidences) -> None:
+    # A start whose distances are infinite leaves no residuals to judge.
+    eg.refine_fundamental(*scene("planar", 20, 0.3, np.random.default_rng(1)))
+    infinite = replace(evidences[-1][0], noise=float("inf"))
+    assert diagnose(infinite, 0.0, ambiguous=False) == ("weak geometry",)

@@ -117,6 +117,8 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     .. [2] O. Chum, T. Werner, J. Matas, "Two-view geometry estimation unaffected by a dominant
        plane", CVPR 2005.
     """
+    if not np.isfinite(found.noise):
+        return ("weak geometry",)  # a run that did not begin: there are no residuals to judge
     n, p = int(np.count_nonzero(found.inlier)), found.parameters
     raised = {
         "ambiguous": ambiguous,

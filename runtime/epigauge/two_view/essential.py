@@ -171,7 +171,8 @@ class Calibrated:
         """
         rays = self.rays(*hats)
         R, t = motions(np.swapaxes(self.A2, 0, 1) @ F @ self.A1)
-        nearest = self._from_ends(R, t) / unit2
+        with np.errstate(over="ignore"):
+            nearest = self._from_ends(R, t) / unit2
         excess = np.where(in_front(R, t, *rays), 0.0, np.maximum(nearest - squared, 0.0))
         least2 = np.maximum(noise2, _ROUNDING**2)[..., None]
         doubt = 0.5 * np.sum(np.minimum(weights * excess / least2, _DOUBT), axis=-1)

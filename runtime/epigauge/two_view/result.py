@@ -162,7 +162,7 @@ class FundamentalResult(Partial):
         """Return `flags` and `success` by some evidence."""
         # Where nothing is redundant the noise is not known: "few matches".
         largest = self._uncertainty.largest() if np.isfinite(self.noise_px) else 0.0
-        if np.isfinite(largest) and self.noise_px > 0.0:
+        if np.isfinite(largest) and 0.0 < self.noise_px < np.inf:
             largest *= found.noise / found.to_units1[0, 0] / self.noise_px
         flags = diagnose(found, largest, self.ambiguous)
         usable = verdicts.usable(flags, "F" if self.E is None else "E")
