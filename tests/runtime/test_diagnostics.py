@@ -208,6 +208,7 @@ def test_one_match_far_beyond_the_noise_is_suspicious(evidences) -> None:
 
 def test_a_run_that_did_not_begin_has_flags(evidences) -> None:
     # A start whose distances are infinite leaves no residuals to judge.
-    eg.refine_fundamental(*scene("planar", 20, 0.3, np.random.default_rng(1)))
+    x1, x2 = scene("planar", 20, 0.3, np.random.default_rng(1))
+    eg.refine_fundamental(x1, x2, backend="numpy")
     infinite = replace(evidences[-1][0], noise=float("inf"))
     assert diagnose(infinite, 0.0, ambiguous=False) == ("weak geometry",)
