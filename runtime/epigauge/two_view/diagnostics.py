@@ -179,7 +179,9 @@ def _plane(found: Evidence) -> dict[str, bool]:
     if found.from_rays is None:
         turned = may_be_rotation(found, model.H, model.normal)
     else:
-        S_R = float(weights @ Calibrated(q1, q2, *found.from_rays).from_rotation(weights))
+        squared = Calibrated(q1, q2, *found.from_rays).from_rotation(weights)
+        with np.errstate(invalid="ignore"):  # a match that no rotation maps: none is claimed
+            S_R = float(weights @ squared)
         n = len(weights)
         turned = (2 * n - 3) * bound >= (2 * n - 8) * S_R
     still = explained and more <= max(_CHI2_8, 2 * len(weights) * _STILL) * noise2

@@ -175,7 +175,8 @@ class Calibrated:
             nearest = self._from_ends(R, t) / unit2
         excess = np.where(in_front(R, t, *rays), 0.0, np.maximum(nearest - squared, 0.0))
         least2 = np.maximum(noise2, _ROUNDING**2)[..., None]
-        doubt = 0.5 * np.sum(np.minimum(weights * excess / least2, _DOUBT), axis=-1)
+        with np.errstate(over="ignore"):
+            doubt = 0.5 * np.sum(np.minimum(weights * excess / least2, _DOUBT), axis=-1)
         best = np.argmin(doubt, axis=0)[None, ..., None]
         return Motion(
             np.take_along_axis(R, best[..., None], axis=0)[0],
