@@ -178,7 +178,8 @@ def test_an_ill_conditioned_minimum_is_recognised_at_once(monkeypatch):
 def test_exact_matches_end_at_the_rounding_of_the_data(monkeypatch):
     scene = two_view_scene(6.0, n_points=40, noise_px=0.0, seed=5)
     for result in both(monkeypatch, scene.x1, scene.x2, F0=scene.F_true):
-        assert (result.status, result.nfev) == (5, 1)
+        # At the rounding of the data, or one step of that size away from it
+        assert (result.status, result.nfev) in ((5, 1), (3, 2))
 
 
 def test_rows_tell_the_time():
