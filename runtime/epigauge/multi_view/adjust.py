@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -337,8 +337,8 @@ def bundle_adjust(
         verdict = judged(tracks, reconstruction, rejected, *how)
         predicted = reconstruction.project(tracks)
     unit, residuals = job.scale_px**2, tracks.xy - predicted
-    parts = outcome, unit, verdict, rejected, method, scale_px
-    return replace(_result(tracks, reconstruction, residuals, *parts), noise_px=noise_px)
+    parts = outcome, unit, verdict, rejected, method, scale_px, noise_px
+    return _result(tracks, reconstruction, residuals, *parts)
 
 
 def _result(
@@ -351,6 +351,7 @@ def _result(
     rejected: NDArray[np.bool_],
     method: str,
     scale_px: float,
+    noise_px: float,
 ) -> BundleResult:
     """Return the result; `unit` is that of the outcome's cost in square pixels."""
     return BundleResult(
@@ -360,7 +361,7 @@ def _result(
         fun=residuals,
         method=method,
         loss_scale_px=scale_px,
-        noise_px=tracks.unit,
+        noise_px=noise_px,
         flags=verdict.flags,
         rank=verdict.rank,
         n_behind=verdict.n_behind,

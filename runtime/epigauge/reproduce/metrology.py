@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 _MODELS = {"pinhole": ("fx", "fy"), "bal": ("f", "k1"), "brown": ("c", "A1")}
 _NOISE = 0.5
 #: 95 % points of chi-square by degrees of freedom.
-_CHI2 = {1: 3.841, 2: 5.991, 3: 7.815}
+_CHI2 = {2: 5.991, 3: 7.815}
 
 
 @dataclass
@@ -81,13 +81,16 @@ def load_network(
     return file, tracks, start, bar
 
 
-def aligned(reconstruction: MetricReconstruction, X: Array) -> MetricReconstruction:
-    """Return a reconstruction turned and shifted, not scaled, so that its points are nearest X."""
+def aligned(
+    reconstruction: MetricReconstruction, X: Array, *, scaled: bool
+) -> MetricReconstruction:
+    """Return a reconstruction turned, shifted and, if asked for, scaled onto points X."""
     a, b = reconstruction.X - reconstruction.X.mean(axis=0), X - X.mean(axis=0)
-    U, _, Vt = np.linalg.svd(b.T @ a)
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    shift = X.mean(axis=0) - R @ reconstruction.X.mean(axis=0)
-    return transform(reconstruction, similarity(1.0, R, shift))
+    U, values, Vt = np.linalg.svd(b.T @ a)
+    signs = np.array([1.0, 1.0, np.linalg.det(U @ Vt)])
+    R, s = (U * signs) @ Vt, float(values @ signs / np.sum(a**2)) if scaled else 1.0
+    shift = X.mean(axis=0) - s * R @ reconstruction.X.mean(axis=0)
+    return transform(reconstruction, similarity(s, R, shift))
 
 
 def network(study: MetrologyStudy) -> Section:
@@ -100,7 +103,10 @@ def network(study: MetrologyStudy) -> Section:
     free = tuple(file["camera_names"].tolist())
     result = bundle_adjust(tracks, start, refine=free, priors=[bar], ftol=1e-10)
     cov = covariance(
-        tracks, aligned(result.reconstruction, file["own_points"]), refine=free, priors=[bar]
+        tracks,
+        aligned(result.reconstruction, file["own_points"], scaled=False),
+        refine=free,
+        priors=[bar],
     )
     std = cov.std
     own = [camera_model("brown").adjusted.index(name) for name in free]
@@ -184,11 +190,7 @@ def _moved_to(
 ) -> MetricReconstruction:
     """Return an estimate moved so that it agrees with the truth in what the datum holds."""
     if datum == "inner":
-        a, b = found.X - found.X.mean(axis=0), truth.X - truth.X.mean(axis=0)
-        U, values, Vt = np.linalg.svd(b.T @ a)
-        R, s = U @ Vt, float(values.sum() / np.sum(a**2))
-        shift = truth.X.mean(axis=0) - s * R @ found.X.mean(axis=0)
-        return transform(found, similarity(s, R, shift))
+        return aligned(found, truth.X, scaled=True)
     here, there = (datum.similarity(r.vectors, r.X) for r in (found, truth))
     back = there.inverse()
     s, R = here.scale * back.scale, back.rotation @ here.rotation

@@ -20,7 +20,7 @@ from epigauge.bundle.priors import Prior
 from epigauge.bundle.problem import Estimate
 from epigauge.bundle.run import bundle_problem
 from epigauge.bundle.similarity import Similarity
-from epigauge.cameras import MetricReconstruction, camera_model
+from epigauge.cameras import MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.tracks import Tracks
 from epigauge.two_view.losses import Loss
@@ -33,8 +33,6 @@ Array = NDArray[np.float64]
 
 #: Numbers of a camera's own tangent before its intrinsics: turn and move.
 _POSE = 6
-
-_KINDS = ("camera", "intrinsics", "point")
 
 
 @dataclass(frozen=True)
@@ -91,7 +89,6 @@ class MetricCovariance:
     _projection: Projection
     _home: Similarity
     _rows: tuple[Array, Array]
-    _unit: float
 
     def in_gauge(self, gauge: Any) -> MetricCovariance:
         """Return the covariance in another datum, from the same inverse.
@@ -176,13 +173,13 @@ class MetricCovariance:
         if first.view is None and second.view is None:
             block = self._inverse.pair(first.index, second.index)
         elif first.view is None:
-            block = self._inverse.between(self._of(second), first.index).T
+            block = self._inverse.cross(first.index)[second.view].T
         elif second.view is None:
-            block = self._inverse.between(self._of(first), second.index)
+            block = self._inverse.cross(second.index)[first.view]
         else:
             block = self._inverse.cameras[first.view, :, second.view]
         block = block + self._low(first) @ self._middle @ self._low(second).T
-        return np.asarray(self._variance * first.out @ block @ second.out.T)
+        return np.asarray(self.noise_px**2 * first.out @ block @ second.out.T)
 
     def joint(self, parts: Sequence[tuple[str, int]]) -> Array:
         """Return the covariance of several parts together.
@@ -308,7 +305,7 @@ class MetricCovariance:
         blocks = self._inverse.cameras[np.arange(n), :, np.arange(n)]
         blocks = blocks + np.einsum("ndq,qr,ner->nde", low[0], middle, low[0], optimize=True)
         poses = (
-            self._variance
+            self.noise_px**2
             * self._poses
             @ blocks[:, :_POSE, :_POSE]
             @ np.swapaxes(self._poses, 1, 2)
@@ -318,9 +315,9 @@ class MetricCovariance:
         turned = self._space @ points @ self._space.T
         cameras = self.reconstruction.cameras
         first = np.unique(cameras.camera_of_view, return_index=True)[1]
-        of_points = np.sqrt(np.maximum(self._variance * np.einsum("mii->mi", turned), 0.0))
+        of_points = np.sqrt(np.maximum(self.noise_px**2 * np.einsum("mii->mi", turned), 0.0))
         of_points[self._inverse.at_infinity] = np.inf
-        own = np.einsum("nii->ni", blocks)[first, _POSE:d] * self._variance
+        own = np.einsum("nii->ni", blocks)[first, _POSE:d] * self.noise_px**2
         of_poses = np.sqrt(np.maximum(np.einsum("nii->ni", poses), 0.0))
         return Std(
             of_poses[:, :3],
@@ -328,10 +325,6 @@ class MetricCovariance:
             np.sqrt(np.maximum(own, 0.0)),
             of_points,
         )
-
-    @property
-    def _variance(self) -> float:
-        return (self.noise_px / self._unit) ** 2
 
     @cached_property
     def _columns(self) -> tuple[Array, Array]:
@@ -369,10 +362,6 @@ class MetricCovariance:
             self._columns[1][part.index] if part.view is None else self._columns[0][part.view]
         )
 
-    def _of(self, part: _Part) -> int:
-        assert part.view is not None
-        return part.view
-
     def _part(self, name: str, value: Any) -> _Part:
         cameras = self.reconstruction.cameras
         counts = {
@@ -384,7 +373,7 @@ class MetricCovariance:
             kind, index = value
             count = counts[kind]
         except (TypeError, ValueError, KeyError):
-            needed = f"a kind ({', '.join(_KINDS)}) and a number, as ('point', 3)"
+            needed = f"a kind ({', '.join(counts)}) and a number, as ('point', 3)"
             raise ArgumentError(name, f"is {value!r:.60}", needed) from None
         integer = isinstance(index, int | np.integer) and not isinstance(index, bool)
         if not integer or not 0 <= index < count:
@@ -470,7 +459,6 @@ def metric_covariance(
         projection(gauge, cameras, points, inverse),
         home,
         (cameras, points),
-        1.0,
     )
 
 
@@ -478,7 +466,7 @@ def _redundancy(tracks: Tracks, job: Job, inverse: Inverse) -> int:
     """Return how many observations and priors there are beyond what the unknowns need."""
     ties = job.freedom.ties
     n, m = tracks.n_views, tracks.n_points
-    d = camera_model(job.model.name).tangent_size
+    d = job.model.tangent_size
     of_views = n * d if ties.A is None else int(np.count_nonzero(ties.A.any(axis=1)))
     of_points = 3 * m if ties.C is None else int(np.count_nonzero(ties.C.any(axis=1)))
     observed = 2 * int(np.count_nonzero(tracks.weights > 0.0))

@@ -21,7 +21,7 @@ from epigauge.multi_view.gauge import (
     reference_camera,
     two_cameras,
 )
-from epigauge.uncertainty.inverse import Inverse
+from epigauge.uncertainty.inverse import Inverse, products
 
 __all__ = ["Datum", "Projection", "projection"]
 
@@ -77,7 +77,7 @@ def projection(datum: Any, cameras: Array, points: Array, inverse: Inverse) -> P
         C = _first(C, G, free)
     elif C[0].shape[2] > free:
         C = C[0] @ motions.open, C[1] @ motions.open
-    product = _product(C, G)
+    product = products(C, G)
     values = np.linalg.svd(product, compute_uv=False)
     if len(product) < free or not values[-1] > 1e-9 * values[0]:
         raise ArgumentError(
@@ -87,7 +87,7 @@ def projection(datum: Any, cameras: Array, points: Array, inverse: Inverse) -> P
     back = np.linalg.inv(product).T
     K = C[0] @ back, C[1] @ back
     T = inverse.apply(*K)
-    R = _product(K, T)
+    R = products(K, T)
     L = np.concatenate([G[0], T[0]], axis=2), np.concatenate([G[1], T[1]], axis=2)
     one, zero = np.eye(free), np.zeros((free, free))
     return Projection(*L, np.block([[0.5 * (R + R.T), -one], [-one, zero]]))
@@ -98,14 +98,9 @@ def _is_inner(datum: Any) -> bool:
     return text or datum is inner or isinstance(datum, inner | normalized)
 
 
-def _product(first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
-    cameras = np.einsum("ndk,ndl->kl", first[0], second[0], optimize=True)
-    return np.asarray(cameras + np.einsum("mik,mil->kl", first[1], second[1], optimize=True))
-
-
 def _first(C: tuple[Array, Array], G: tuple[Array, Array], free: int) -> tuple[Array, Array]:
     """Return the first conditions that suffice: the rest of the gauge is held by what is known."""
-    product = _product(C, G)
+    product = products(C, G)
     chosen: list[int] = []
     for k in range(len(product)):
         trial = product[[*chosen, k]]

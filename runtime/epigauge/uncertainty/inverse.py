@@ -24,7 +24,7 @@ from epigauge.bundle.ties import Ties
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 
-__all__ = ["Inverse", "Motions"]
+__all__ = ["Inverse", "Motions", "products"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -207,9 +207,9 @@ class Inverse:
         XF = G[0] @ back[:, first:] - weak[0], G[1] @ back[:, first:] - weak[1]
         XB = plain.apply(*B)
         L = np.concatenate([XB[0], XF[0]], axis=2), np.concatenate([XB[1], XF[1]], axis=2)
-        across = _along(B, XF)
+        across = products(B, XF)
         left = np.einsum("ndk,ndl->kl", F[..., first:], weak[0])
-        inner = np.block([[np.eye(across.shape[0]) + _along(B, XB), across], [across.T, -left]])
+        inner = np.block([[np.eye(across.shape[0]) + products(B, XB), across], [across.T, -left]])
         M = -np.linalg.inv(0.5 * (inner + inner.T))
         return Inverse(*parts, *L, 0.5 * (M + M.T), motions, open_rays)
 
@@ -222,7 +222,7 @@ class Inverse:
         back = edges.sum_points(np.swapaxes(self.W, 1, 2) @ x[edges.view])
         y = self.V_inverse @ (points - back)
         if self.M.size:
-            small = self.M @ _along((self.L_cameras, self.L_points), (cameras, points))
+            small = self.M @ products((self.L_cameras, self.L_points), (cameras, points))
             x, y = x + self.L_cameras @ small, y + self.L_points @ small
         return x, y
 
@@ -245,10 +245,6 @@ class Inverse:
                 among = among.transpose(0, 1, 3, 2, 4).reshape(len(chunk), k * d, k * d)
                 found[chunk] += np.swapaxes(Y, 1, 2) @ (among @ Y)
         return found
-
-    def between(self, view: int, point: int) -> Array:
-        """Return the block of X_0 of a camera and a point, (d, 3)."""
-        return np.asarray(self.cross(point)[view])
 
     def cross(self, point: int) -> Array:
         """Return the blocks of X_0 of all cameras and a point, (n, d, 3)."""
@@ -277,7 +273,7 @@ def _firm(
     return alone.U @ motions[0], alone.V @ motions[1]
 
 
-def _along(first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
+def products(first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
     """Return the products (k, l) of columns in cameras and points."""
     cameras = np.einsum("ndk,ndl->kl", first[0], second[0], optimize=True)
     return np.asarray(cameras + np.einsum("mik,mil->kl", first[1], second[1], optimize=True))
