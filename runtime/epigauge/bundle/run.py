@@ -212,6 +212,8 @@ def minimized(
         minimize = far.minimize if jumps else lm.minimize
         begun, unit = Estimate(cameras, points), job.scale_px**2
         outcome = minimize(problem, begun, act, schedule(), stopping, callback, unit)
+        if homogeneous and home and outcome.system is None and np.isfinite(outcome.state.cost):
+            outcome = replace(outcome, system=problem.linearize(outcome.state))
         found = outcome.state.cameras, outcome.state.points
         claims = homogeneous and outcome.status > 0 and not jumps
         if claims and not checked(*found, outcome.state, begun):

@@ -333,8 +333,9 @@ def bundle_adjust(
         free = fixed, job.fixes_gauge or reference
         verdict = judged_metric(tracks, reconstruction, depths, outcome, table, *free)
     else:
-        how = loss == "linear", table, workers, stays if job.fixes_gauge else None
-        verdict = judged(tracks, reconstruction, rejected, *how)
+        linear = loss == "linear"
+        how = linear, table, workers, stays if job.fixes_gauge else None
+        verdict = judged(tracks, reconstruction, rejected, *how, outcome.system if linear else None)
         predicted = reconstruction.project(tracks)
     unit, residuals = job.scale_px**2, tracks.xy - predicted
     parts = outcome, unit, verdict, rejected, method, scale_px, noise_px

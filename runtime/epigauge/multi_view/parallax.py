@@ -33,8 +33,9 @@ _NONE, _FEW = 0.05, 0.1
 #: that turned: beyond it, the camera may only have turned.
 _TURNED = 0.75
 
-#: Reweighted least squares against points off the plane.
-_ROUNDS = 8
+#: Reweighted least squares against points off the plane. It converges quadratically where nine in
+#: ten are on one: where after the second number of rounds most are off it, more will not help.
+_ROUNDS, _FIRST_ROUNDS, _MOSTLY = 8, 3, 0.5
 
 
 def parallax_flags(seen: Seen, noise_px: float) -> tuple[str, ...]:
@@ -54,6 +55,8 @@ def parallax_flags(seen: Seen, noise_px: float) -> tuple[str, ...]:
         tell.
     """
     limit = _OFF * float(np.sqrt(2.0)) * max(noise_px, 1e-9 * float(np.abs(seen.xy).max()))
+    if _plainly_off(seen, limit):
+        return ()
     shares: list[Array] = []
     rotations: list[bool] = []
     still: list[Array] = []
@@ -77,28 +80,42 @@ def parallax_flags(seen: Seen, noise_px: float) -> tuple[str, ...]:
     return ("planar scene", "pure rotation") if turned else ("planar scene",)
 
 
+def _plainly_off(seen: Seen, limit: float) -> bool:
+    """Tell whether a first pair, of views far from each other in a sequence, shows parallax."""
+    others = _partners(seen, np.searchsorted(seen.point, np.arange(seen.m + 1)), 0)
+    if not len(others):
+        return False
+    x1, x2, first = _matches(seen, np.array([[0, others.max()]]))
+    off = fit_homographies(x1, x2, first, _FIRST_ROUNDS).distances > limit
+    return bool(np.mean(off) > _MOSTLY)
+
+
+def _partners(seen: Seen, begin: Indices, i: int) -> Indices:
+    """Return views with points in common with view i: with the fewest, with some, with the most."""
+    own = seen.point[seen.view == i]
+    lengths = begin[own + 1] - begin[own]
+    rows = np.repeat(begin[own] - np.cumsum(lengths) + lengths, lengths)
+    common = np.bincount(seen.view[rows + np.arange(len(rows))], minlength=seen.n)
+    common[i] = 0
+    others = np.flatnonzero(common >= _LEAST)
+    others = others[np.argsort(common[others], kind="stable")]
+    spread = np.linspace(0, len(others) - 1, min(len(others), _PARTNERS))
+    return others[spread.astype(np.intp)]
+
+
 def _pairs(seen: Seen) -> Iterator[Indices]:
     """Give pairs of views, some at a time: partners with few, some and many points in common.
 
     Those with few see from far apart. Views are asked at a bounded number of places in a sequence.
     """
-    n, view, point = seen.n, seen.view, seen.point
-    begin = np.searchsorted(point, np.arange(seen.m + 1))
-    lengths = np.diff(begin)
-    asked = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).astype(np.intp))
+    begin = np.searchsorted(seen.point, np.arange(seen.m + 1))
+    asked = np.unique(np.linspace(0, seen.n - 1, min(seen.n, _VIEWS)).astype(np.intp))
     # Evenly spread from the first few on.
     stride = -(-len(asked) // _AT_ONCE)
     for some in (asked[k::stride] for k in range(stride)):
         chosen: list[tuple[int, int]] = []
         for i in some.tolist():
-            own = point[view == i]
-            rows = np.repeat(begin[own] - np.cumsum(lengths[own]) + lengths[own], lengths[own])
-            common = np.bincount(view[rows + np.arange(len(rows))], minlength=n)
-            common[i] = 0
-            others = np.flatnonzero(common >= _LEAST)
-            others = others[np.argsort(common[others], kind="stable")]
-            spread = np.linspace(0, len(others) - 1, min(len(others), _PARTNERS))
-            chosen += [(i, k) for k in others[spread.astype(np.intp)].tolist()]
+            chosen += [(i, k) for k in _partners(seen, begin, i).tolist()]
         if chosen:
             yield np.array(chosen)
 
@@ -155,7 +172,7 @@ class Homographies:
         return bool(abs(difference) <= 3.0 * deviation)
 
 
-def fit_homographies(x1: Array, x2: Array, first: Indices) -> Homographies:
+def fit_homographies(x1: Array, x2: Array, first: Indices, rounds: int = _ROUNDS) -> Homographies:
     """Fit a homography to each group of matches, robustly: reweighted normal equations (DLT).
 
     Parameters
@@ -164,6 +181,8 @@ def fit_homographies(x1: Array, x2: Array, first: Indices) -> Homographies:
         Matches of all groups, in pixels.
     first : ndarray of int, shape (k + 1,)
         First match of each group, and m.
+    rounds : int
+        Fits, each with the weights that the one before gives.
 
     Returns
     -------
@@ -180,7 +199,7 @@ def fit_homographies(x1: Array, x2: Array, first: Indices) -> Homographies:
     terms = np.stack([np.ones(len(a)), *b.T, np.sum(b**2, axis=1)], axis=1)
     blocks = terms[:, :, None, None] * square[:, None]
     weights = np.ones(len(a))
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         sums = np.add.reduceat(weights[:, None, None, None] * blocks, first[:-1])
         N = np.zeros((len(first) - 1, 9, 9))
         N[:, :3, :3] = N[:, 3:6, 3:6] = sums[:, 0]
@@ -192,7 +211,7 @@ def fit_homographies(x1: Array, x2: Array, first: Indices) -> Homographies:
         h = np.einsum("mij,mj->mi", H[group], a)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             distances = np.linalg.norm(h[:, :2] / h[:, 2:] - b, axis=1)
-        distances = np.nan_to_num(distances, nan=1e3, posinf=1e3)
+        distances[~np.isfinite(distances)] = 1e3
         typical = np.maximum(_medians(distances, group, first), 1e-9)[group]
         # Algebraic errors are h_3 times geometric ones.
         depth = h[:, 2] ** 2 / np.repeat(_means(h[:, 2] ** 2, first), np.diff(first))

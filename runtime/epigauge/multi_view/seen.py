@@ -57,6 +57,9 @@ class Seen:
         # A point needs two observations to be a part of what is judged.
         lengths = np.bincount(tracks.point[counts], minlength=tracks.n_points)
         counts &= lengths[tracks.point] >= MIN_VIEWS
+        if counts.all():
+            every, observed = np.arange(tracks.n_views), (tracks.xy, tracks.weights)
+            return Seen(tracks.view, tracks.point, *observed, found.P, found.Q, every), 0
         views, view = np.unique(tracks.view[counts], return_inverse=True)
         points, point = np.unique(tracks.point[counts], return_inverse=True)
         before = len(np.unique(tracks.view[tracks.weights > 0.0]))

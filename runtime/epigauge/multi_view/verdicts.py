@@ -73,6 +73,9 @@ _EXACT = 1e-8
 #: extent, and they lead to the published optimum all the same.
 _BEYOND, _TOO_FEW = 0.2, 1e-4
 
+#: Least over largest spread of points in a basis that suits computing.
+_SPREAD = 0.01
+
 #: Share of single points that may be open without the rest being called undetermined.
 _OPEN = 0.05
 
@@ -115,6 +118,7 @@ def judged(
     kernels: Table,
     workers: int = 1,
     fixed: tuple[Indices, Indices] | None = None,
+    system: object = None,
 ) -> Verdict:
     """Judge an adjusted reconstruction.
 
@@ -134,6 +138,8 @@ def judged(
         Threads.
     fixed : tuple of ndarray of int, optional
         Views and points that are no unknowns.
+    system : BundleSystem, optional
+        Normal equations of all observations at the minimum, in any basis, where they are known.
 
     Returns
     -------
@@ -148,7 +154,10 @@ def judged(
     n_behind = behind(seen, h[:, 2])
     if not np.isfinite(distances).all():  # a point in a focal plane: there is nothing to measure
         return Verdict(("undetermined",), 0, n_behind)
-    of_cameras, of_points, weakest = _open_directions(seen, Frame.of(tracks), kernels, workers)
+    frame = Frame.of(tracks)
+    if len(seen.view) < len(tracks) or not (isinstance(system, BundleSystem) and _suits(system)):
+        system = None
+    of_cameras, of_points, weakest = _open_directions(seen, frame, kernels, workers, system)
     of_cameras = max(missing_by_count(seen), of_cameras) + _CAMERA * lost
     views, points = (len(part) for part in fixed or ((), ()))
     if fixed is not None:
@@ -161,16 +170,12 @@ def judged(
     # Of two normal coordinates, the median distance is 1.1774 standard deviations.
     noise_px = robust_scale(distances) / 1.4826 / 1.1774 / float(np.sqrt(redundancy))
     information = max(weakest, 1e-300) * N / seen.n
-    deviation = noise_px / Frame.of(tracks).scale / float(np.sqrt(information))
+    deviation = noise_px / frame.scale / float(np.sqrt(information))
     # Where the fit is bad, nothing is within its noise.
-    fits = noise_px < _FITS * Frame.of(tracks).scale
+    fits = noise_px < _FITS * frame.scale
     judge = fits and views < len(found.P)
     raised = set(parallax_flags(seen, noise_px)) if judge else set()
-    extent = _extent(seen.xy)
-    usual = _HEAVY * max(noise_px, _EXACT * extent)
-    heavy = float(np.sqrt(np.mean(distances**2) / 2.0)) > usual
-    beyond = np.count_nonzero(distances > max(_BEYOND * extent, usual))
-    if bends and (heavy or beyond > _TOO_FEW * N):
+    if bends and _has_gross_errors(distances, noise_px, seen.xy):
         raised.add("gross errors")
     if of_cameras or of_points > _OPEN * seen.m:
         raised.add("undetermined")
@@ -180,6 +185,17 @@ def judged(
         raised.add("behind the cameras")
     condition = float("inf") if of_cameras or not weakest > 0.0 else 1.0 / weakest
     return Verdict(ordered(raised), full - of_cameras - of_points, n_behind, condition)
+
+
+def _has_gross_errors(distances: Array, noise_px: float, xy: Array) -> bool:
+    """Tell whether few residuals carry the cost, or more than a very few are very large."""
+    if distances.max() <= _HEAVY * noise_px:  # the extent can only raise the bounds
+        return False
+    extent = _extent(xy)
+    usual = _HEAVY * max(noise_px, _EXACT * extent)
+    heavy = float(np.sqrt(np.mean(distances**2) / 2.0)) > usual
+    beyond = np.count_nonzero(distances > max(_BEYOND * extent, usual))
+    return bool(heavy or beyond > _TOO_FEW * len(distances))
 
 
 def _extent(xy: Array) -> float:
@@ -328,6 +344,10 @@ def missing_by_count(seen: Seen) -> int:
     # A point twice in a view gives that view no more than once does.
     once = (np.diff(seen.point, prepend=-1) != 0) | (np.diff(seen.view, prepend=-1) != 0)
     view, point = seen.view[once], seen.point[once]
+    everywhere = int(np.count_nonzero(np.bincount(point) == seen.n))
+    enough = max((_CAMERA * seen.n - _GAUGE) / (2 * seen.n - _POINT), _CAMERA / 2)
+    if seen.n > 2 and everywhere >= enough:
+        return 0  # these alone give all cameras what they need
     # Points are told apart by the views that see them: sums of one random number a view.
     marks = np.random.default_rng(0).integers(0, 2**62, seen.n, dtype=np.uint64)
     first = np.flatnonzero(np.diff(point, prepend=-1))
@@ -346,8 +366,18 @@ def missing_by_count(seen: Seen) -> int:
     return max(total, int(_CAMERA - own.min()) if seen.n > 2 else 0, 0)
 
 
+def _suits(system: BundleSystem) -> bool:
+    """Tell whether normal equations are those of all parameters, in a basis fit to compute in."""
+    ties = system.ties
+    if ties.n_shared or ties.A is not None or ties.C is not None or system.constraints is not None:
+        return False
+    Q = system.points / np.linalg.norm(system.points, axis=1, keepdims=True)
+    values = np.linalg.eigvalsh(Q.T @ Q)
+    return bool(values[0] > _SPREAD * values[-1])
+
+
 def _open_directions(
-    seen: Seen, frame: Frame, kernels: Table, workers: int
+    seen: Seen, frame: Frame, kernels: Table, workers: int, system: BundleSystem | None
 ) -> tuple[int, int, float]:
     """Return how many directions beside the gauge N leaves open, and its least other eigenvalue.
 
@@ -355,22 +385,25 @@ def _open_directions(
 
     In parameters in which W of the covariant damping is one, for which the basis does not matter.
     """
-    graph = ObservationGraph(seen.view, seen.point, seen.n, seen.m)
-    origins = frame.origins[seen.views]
-    own = Frame(origins, frame.scale)
-    q = own.points_in(seen.xy, seen.view)
-    P = own.cameras_in(seen.P)
     try:
         # Where a camera or a point is all but undefined, numbers overflow: it is open.
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            parts = camera_model("projective"), kernels, graph, q, seen.weights
-            problem = bundle_problem(*parts, workers=workers)
-            P, Q = normalized().transformation(P, seen.Q).apply(P, seen.Q)
-            system = problem.linearize(BundleState(Estimate(P.reshape(-1, 12), Q), 0.0))
+            system = system or _normal_equations(seen, frame, kernels, workers)
             found = _measured(system, kernels)
     except np.linalg.LinAlgError:
         return 1, 0, 0.0
     return found if np.isfinite(found[2]) else (1, 0, 0.0)
+
+
+def _normal_equations(seen: Seen, frame: Frame, kernels: Table, workers: int) -> BundleSystem:
+    """Return the normal equations of what counts, in the best conditioned basis."""
+    graph = ObservationGraph(seen.view, seen.point, seen.n, seen.m)
+    own = Frame(frame.origins[seen.views], frame.scale)
+    parts = camera_model("projective"), kernels, graph, own.points_in(seen.xy, seen.view)
+    P = own.cameras_in(seen.P)
+    P, Q = normalized().transformation(P, seen.Q).apply(P, seen.Q)
+    problem = bundle_problem(*parts, seen.weights, workers=workers)
+    return problem.linearize(BundleState(Estimate(P.reshape(-1, 12), Q), 0.0))
 
 
 def _measured(system: BundleSystem, kernels: Table) -> tuple[int, int, float]:
@@ -449,6 +482,8 @@ def _grounded(V: Array) -> tuple[int, Array]:
         thin = np.flatnonzero(diagonal.min(axis=1) ** 2 <= 1e3 * _ROUNDING)
     except np.linalg.LinAlgError:  # some block is singular to rounding: all are looked at
         thin = np.arange(len(V))
+    if not len(thin):
+        return 0, V
     values, vectors = np.linalg.eigh(V[thin])
     open_ = values <= _ROUNDING
     V = V.copy()
