@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._arguments import as_count
+from epigauge._results import Result
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._common import PathLike
 from epigauge.two_view.batch import (
@@ -75,7 +76,7 @@ _FROM_DATABASE = ("F0", "weights", "covariance1", "covariance2", "callback", "fl
 
 
 @dataclass(frozen=True)
-class DatabaseResult:
+class DatabaseResult(Result):
     """What became of the verified pairs of a COLMAP database, one row a pair.
 
     Lengths are in pixels. F belongs to COLMAP's pixels, with (0.5, 0.5) in the middle of the
@@ -139,6 +140,18 @@ class DatabaseResult:
     def __len__(self) -> int:
         """Return the number of pairs."""
         return len(self.pair_id)
+
+    def _arrays(self) -> dict[str, Any]:
+        names = {"image_numbers": list(self.names), "image_names": list(self.names.values())}
+        arrays = {name: value for name, value in self._contents().items() if name != "names"}
+        return names | arrays
+
+    def _heading(self) -> str:
+        return f"DatabaseResult: {len(self)} pairs of {len(self.names)} images"
+
+    def _summary_rows(self) -> dict[str, str]:
+        counts = {verdict: self.verdict.count(verdict) for verdict in VERDICTS}
+        return {verdict: str(count) for verdict, count in counts.items() if count}
 
 
 def refine_database(

@@ -59,6 +59,10 @@ class Table:
         """Tell whether the passes over observations of runtime/c belong to this back end."""
         return self.name == "c"
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the name alone: compiled functions have no other form."""
+        return _restored, (self.name,)
+
     def __getattr__(self, kernel: str) -> Kernel:
         raise AttributeError(f"no kernel is named {kernel!r}; there are: {', '.join(SIGNATURES)}")
 
@@ -144,6 +148,11 @@ def table(name: str | None = None) -> Table:
     elif chosen == "casadi" and available()["casadi"] is not None:
         raise BackendError(chosen, "needs the package casadi", "pip install 'epigauge[casadi]'")
     return _table(chosen)
+
+
+def _restored(name: str) -> Table:
+    """Return the table of a backend, or NumPy's where that is not here."""
+    return table(name if available()[name] is None else "numpy")
 
 
 @cache

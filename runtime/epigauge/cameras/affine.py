@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._arguments import as_real
+from epigauge._results import Result
 from epigauge.cameras.checks import counted, finite_rows, frozen
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.tracks import Reconstruction, Tracks
@@ -18,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class AffineReconstruction:
+class AffineReconstruction(Result):
     """Affine cameras and points: shape up to an affine change of space.
 
     Parameters
@@ -125,6 +126,12 @@ class AffineReconstruction:
             A start for perspective: its cameras have their centres at infinity.
         """
         return Reconstruction(self.P, np.column_stack([self.X, np.ones(len(self.X))]))
+
+    def _heading(self) -> str:
+        return repr(self)
+
+    def _summary_rows(self) -> dict[str, str]:
+        return {"cameras": "affine, known up to an affine change of space"}
 
     def __reduce__(self) -> tuple[type, tuple[Array, Array]]:
         """Pickle the arguments: arrays from a pickle could be written to."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge._results import Result
 from epigauge.cameras.checks import counted, finite_rows, frozen
 from epigauge.cameras.intrinsics import Cameras
 from epigauge.cameras.models import camera_model
@@ -26,7 +27,7 @@ _BLOCK = 4096
 
 
 @dataclass(frozen=True, eq=False)
-class MetricReconstruction:
+class MetricReconstruction(Result):
     """Calibrated cameras and points: shape without unit of length, place and direction in space.
 
     Parameters
@@ -221,6 +222,16 @@ class MetricReconstruction:
             was = f"are of the model {self.cameras.model!r}"
             raise ArgumentError("cameras", was, "a model with an optical axis")
         return np.asarray(K[self.cameras.camera_of_view])
+
+    def _heading(self) -> str:
+        return repr(self)
+
+    def _summary_rows(self) -> dict[str, str]:
+        size = np.ptp(self.X, axis=0)
+        return {
+            "model": self.cameras.model,
+            "extent of the points": " x ".join(f"{side:.4g}" for side in size),
+        }
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the arguments: arrays from a pickle could be written to."""

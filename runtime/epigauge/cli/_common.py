@@ -7,6 +7,7 @@ import functools
 import os
 import sys
 from collections.abc import Callable
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec
 
@@ -17,6 +18,7 @@ from rich.table import Table
 
 import epigauge as eg
 from epigauge import verdicts
+from epigauge._results import SCHEMA
 from epigauge.errors import EpigaugeError
 from epigauge.io._common import check_suffix
 from epigauge.io.output import json_text, plain
@@ -26,6 +28,9 @@ P = ParamSpec("P")
 DONE, NOT_CONVERGED, BAD_INPUT = 0, 1, 2
 #: What a shell reports of a program that Ctrl-C has ended.
 INTERRUPTED = 130
+
+#: Name of the command that runs.
+_running: ContextVar[str] = ContextVar("command", default="")
 
 Json = Annotated[bool, typer.Option("--json", help="Write one JSON document to stdout.")]
 
@@ -39,6 +44,7 @@ def command(function: Callable[P, int]) -> Callable[P, None]:
 
     @functools.wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
+        _running.set(function.__name__)
         try:
             code = function(*args, **kwargs)
             sys.stdout.flush()
@@ -74,8 +80,9 @@ def check_target(path: Path, *suffixes: str) -> None:
 
 
 def write_json(document: dict[str, Any]) -> None:
-    """Write one JSON document to stdout."""
-    typer.echo(json_text(plain(document)))
+    """Write one JSON document to stdout, which says of which command and form it is."""
+    head = {"command": _running.get(), "version": eg.__version__, "schema": SCHEMA}
+    typer.echo(json_text(plain(head | document)))
 
 
 def facts(title: str, rows: dict[str, str]) -> Table:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._arguments import as_matches, as_weights
+from epigauge._results import Result
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._common import PathLike, check_suffix, cut
 from epigauge.io._npz import read_npz, write_npz
@@ -22,7 +23,7 @@ _COLUMNS = Columns("matches", ("x1", "y1", "x2", "y2"), flags=("inlier",))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Matches:
+class Matches(Result):
     """Point matches of an image pair, as read from a file.
 
     Parameters
@@ -49,6 +50,31 @@ class Matches:
 
     def __len__(self) -> int:
         return len(self.x1)
+
+    def save(self, path: PathLike, **more: Any) -> None:
+        """Write them in a form that `load_matches` reads.
+
+        Parameters
+        ----------
+        path : str or path
+            As for `save_matches`: ``.csv``, ``.txt`` or ``.npz``.
+        **more
+            Nothing yet.
+
+        Examples
+        --------
+        >>> eg.Matches(x1, x2).save("pair.csv")  # doctest: +SKIP
+        """
+        save_matches(path, self, **more)
+
+    def _heading(self) -> str:
+        return f"{type(self).__name__}: {len(self)}" + (f" of {self.name}" if self.name else "")
+
+    def _summary_rows(self) -> dict[str, str]:
+        marked = None if self.marked is None else f"{self.marked} as inliers"
+        sizes = {"image 1": self.image_size1, "image 2": self.image_size2}
+        rows = {name: f"{size[0]} x {size[1]} px" for name, size in sizes.items() if size}
+        return rows | ({} if marked is None else {"marked": marked})
 
 
 def load_matches(path: PathLike, inliers: bool = False) -> Matches:

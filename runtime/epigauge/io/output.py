@@ -15,6 +15,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from epigauge._results import Result, identity
 from epigauge.io._common import PathLike, check_suffix
 from epigauge.io._npz import write_npz
 
@@ -32,9 +33,10 @@ def save_result(path: PathLike, result: Any, **more: Any) -> None:
     path : str or path
         The file; ``.npz`` or ``.json`` chooses the form.
     result : dataclass
-        A result such as `FundamentalResult`: every field is written under its own name. In NPZ a
-        history becomes one array a column, ``history_cost`` and so on, and a field that is a
-        dataclass itself, such as a reconstruction, its own fields.
+        A result such as `FundamentalResult`: every field is written under its own name, and beside
+        them its type (`kind`) and the versions of epigauge and of the form (`version`, `schema`).
+        In NPZ a history becomes one array a column, ``history_cost`` and so on, and a field that is
+        a dataclass itself, such as a reconstruction, its own fields.
     **more
         Further fields to write.
 
@@ -48,19 +50,30 @@ def save_result(path: PathLike, result: Any, **more: Any) -> None:
     Notes
     -----
     JSON has no NaN and no infinity: they are written as ``null``.
+
+    Examples
+    --------
+    >>> save_result("pair.json", result)  # doctest: +SKIP
+    >>> eg.load_result("pair.json")["F"]  # doctest: +SKIP
     """
     suffix = check_suffix(path, ".npz", ".json")
+    more = identity(result) | more
     with writing(path) as file:
         if suffix == ".json":
             file.write(json_text(plain(result) | plain(more)).encode() + b"\n")
         else:
-            arrays: dict[str, Any] = {
-                name: np.asarray(value) for name, value in (arrays_of_result(result) | more).items()
-            }
-            pickled = [name for name, array in arrays.items() if array.dtype.hasobject]
-            if pickled:
-                raise TypeError(f"no array form of {', '.join(pickled)}")
-            write_npz(file, arrays)
+            given = arrays_of_result(result) | more
+            write_npz(file, {name: _as_plain_array(name, value) for name, value in given.items()})
+
+
+def _as_plain_array(name: str, value: Any) -> np.ndarray[Any, Any]:
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        array = np.empty((), dtype=object)
+    if array.dtype.hasobject:
+        raise TypeError(f"no array form of {name}: JSON has one")
+    return array
 
 
 def plain(value: Any) -> Any:
@@ -91,8 +104,8 @@ def plain(value: Any) -> Any:
         return [plain(item) for item in value]
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in _fields(value)}
+    if _has_fields(value):
+        return plain(_contents(value))
     raise TypeError(f"no plain form of {type(value).__name__}")
 
 
@@ -148,17 +161,33 @@ def _opened(temporary: Path, path: PathLike) -> IO[bytes]:
 def arrays_of_result(result: Any) -> dict[str, Any]:
     """Turn a result into arrays for NPZ; rows of a history into columns."""
     arrays: dict[str, Any] = {}
-    for field in _fields(result):
-        value = getattr(result, field.name)
-        if isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
-            for column in _fields(value[0]):
-                arrays[f"{field.name}_{column.name}"] = [getattr(row, column.name) for row in value]
-        elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+    for name, value in (
+        result._arrays() if isinstance(result, Result) else _contents(result)
+    ).items():
+        if isinstance(value, list | tuple) and value and _has_fields(value[0]):
+            rows = [_contents(row) for row in value]
+            arrays |= {f"{name}_{column}": [row[column] for row in rows] for column in rows[0]}
+        elif _has_fields(value):
             arrays |= arrays_of_result(value)
         elif value is not None:
-            arrays[field.name] = value
+            arrays[name] = value
     return arrays
 
 
-def _fields(value: Any) -> tuple[dataclasses.Field[Any], ...]:
-    return tuple(field for field in dataclasses.fields(value) if not field.name.startswith("_"))
+def _has_fields(value: Any) -> bool:
+    """Tell whether a value is no number, text or list, but has parts with names."""
+    if isinstance(value, type):
+        return False
+    if isinstance(value, dict):
+        return bool(value)
+    return isinstance(value, Result) or dataclasses.is_dataclass(value)
+
+
+def _contents(value: Any) -> dict[str, Any]:
+    """Return the public fields of a dataclass, a result or a dict, by name."""
+    if isinstance(value, Result):
+        return value._contents()
+    if isinstance(value, dict):
+        return {str(key): item for key, item in value.items()}
+    names = [field.name for field in dataclasses.fields(value)]
+    return {name: getattr(value, name) for name in names if not name.startswith("_")}

@@ -8,6 +8,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from epigauge._results import SavedResult
 from epigauge.errors import FileFormatError
 from epigauge.io._common import PathLike, check_suffix
 from epigauge.io._npz import damage, read_every_array
@@ -21,7 +22,7 @@ _MAX_BYTES = 1_000_000_000
 _WORDS = ("flags",)
 
 
-def load_result(path: PathLike) -> dict[str, Any]:
+def load_result(path: PathLike) -> SavedResult:
     """Read what `save_result` wrote.
 
     Parameters
@@ -31,11 +32,11 @@ def load_result(path: PathLike) -> dict[str, Any]:
 
     Returns
     -------
-    dict
-        Every field by its name: numbers, words and truths as such, lists of numbers as arrays,
-        `flags` as a tuple of str. In a JSON file ``null`` stands for NaN and infinity, which come
-        back as NaN within arrays; a history is a list of dicts there, and one array a column, such
-        as ``history_cost``, in NPZ.
+    SavedResult
+        A dict of every field by its name, which are attributes, too: numbers, words and truths as
+        such, lists of numbers as arrays, `flags` as a tuple of str. In a JSON file ``null`` stands
+        for NaN and infinity, which come back as NaN within arrays; a history is a list of dicts
+        there, and one array a column, such as ``history_cost``, in NPZ.
 
     Raises
     ------
@@ -48,14 +49,20 @@ def load_result(path: PathLike) -> dict[str, Any]:
 
     Examples
     --------
-    >>> found = load_result("pair.npz")  # doctest: +SKIP
-    >>> found["F"], found["success"], found["flags"]  # doctest: +SKIP
+    >>> import os, tempfile, epigauge as eg
+    >>> scene = eg.two_view_scene(seed=1)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "pair.npz")
+    ...     eg.refine_fundamental(scene.x1, scene.x2).save(path)
+    ...     found = eg.load_result(path)
+    >>> found["F"].shape, found.success, found.kind
+    ((3, 3), True, 'FundamentalResult')
     """
     suffix = check_suffix(path, ".npz", ".json")
     path = Path(path)
     with path.open("rb") as file:
         fields = _from_json(path, file) if suffix == ".json" else _from_npz(path, file)
-    return fields | {name: tuple(fields[name]) for name in _WORDS if name in fields}
+    return SavedResult(fields | {name: tuple(fields[name]) for name in _WORDS if name in fields})
 
 
 def _from_npz(path: Path, file: IO[bytes]) -> dict[str, Any]:

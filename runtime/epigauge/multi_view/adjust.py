@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import kernels, lm
 from epigauge._arguments import as_choice, as_count, as_positive
+from epigauge._results import Result
 from epigauge.bundle.dampings import DAMPINGS
 from epigauge.bundle.jobs import AnyReconstruction, job_of
 from epigauge.bundle.observations import ObservationGraph
@@ -31,6 +32,9 @@ from epigauge.multi_view.verdicts import Verdict, judged, judged_metric
 from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
 from epigauge.verdicts import FLAGS, usable
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 __all__ = ["BundleResult", "bundle_adjust"]
 
 Array = NDArray[np.float64]
@@ -43,7 +47,7 @@ _SCHEDULES: dict[str, Callable[[], lm.Schedule]] = {
 
 
 @dataclass(frozen=True)
-class BundleResult:
+class BundleResult(Result):
     """An adjusted reconstruction and how it was found. All lengths are in pixels.
 
     Attributes
@@ -86,6 +90,11 @@ class BundleResult:
         As in `FundamentalResult`.
     """
 
+    _shown: ClassVar[tuple[str, ...]] = (
+        *("reconstruction", "rms_px", "cost", "method", "noise_px", "n_behind", "condition"),
+        *("nfev", "message"),
+    )
+
     reconstruction: Any = field(repr=False)
     rms_px: float
     cost: float
@@ -106,6 +115,41 @@ class BundleResult:
     message: str
     success: bool
     history: tuple[lm.Row, ...] = field(repr=False)
+
+    def _summary_rows(self) -> dict[str, str]:
+        aside = f"{np.count_nonzero(self.rejected)} of {len(self.rejected)} observations"
+        rows = super()._summary_rows()
+        return rows | ({"set aside": aside} if self.rejected.any() else {})
+
+    def plot(self, tracks: Tracks, title: str = "", **options: Any) -> Figure:
+        """Draw cameras and points from three sides, the residuals, and the convergence.
+
+        Parameters
+        ----------
+        tracks : Tracks
+            What was adjusted.
+        title : str
+            What to call them.
+        **options
+            Of `epigauge.plots.plot_bundle`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            The picture; `epigauge.plots.save_figure` writes it.
+
+        Raises
+        ------
+        MissingPackageError
+            If Matplotlib is not installed.
+
+        Examples
+        --------
+        >>> result.plot(tracks)  # doctest: +SKIP
+        """
+        from epigauge.plots import plot_bundle
+
+        return plot_bundle(self, tracks, title, **options)
 
 
 @merging_sightings

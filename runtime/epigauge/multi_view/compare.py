@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from epigauge import lm
 from epigauge._arguments import as_choice
+from epigauge._results import Result
 from epigauge.bundle.run import PROJECTIVE_ONLY
 from epigauge.bundle.strategies import STRATEGIES
 from epigauge.cameras import MetricReconstruction
@@ -47,7 +48,7 @@ class ComparedMethod:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(Result):
     """Methods side by side.
 
     Attributes
@@ -60,6 +61,23 @@ class Comparison:
 
     rows: tuple[ComparedMethod, ...]
     start_rms_px: float
+
+    def _heading(self) -> str:
+        return f"Comparison: {len(self.rows)} methods from a start of {self.start_rms_px:.6g} px"
+
+    def _summary_rows(self) -> dict[str, str]:
+        return {
+            row.method: f"{row.rms_px:.6f} px RMS, {row.nfev} evaluations, {row.seconds:.2f} s: "
+            f"{row.message}"
+            for row in self.rows
+        }
+
+    def _arrays(self) -> dict[str, Any]:
+        names = [f.name for f in fields(ComparedMethod) if f.name not in ("flags", "history")]
+        arrays: dict[str, Any] = {name: [getattr(r, name) for r in self.rows] for name in names}
+        arrays["flags"] = ["; ".join(row.flags) for row in self.rows]
+        histories = {f"{row.method}_history": row.history for row in self.rows}
+        return arrays | histories | {"start_rms_px": self.start_rms_px}
 
     def to_markdown(self) -> str:
         """Return a table in Markdown.

@@ -5,13 +5,18 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge._arguments import MAX_PX, MIN_PX, as_array, as_choice, as_double, as_real, as_weights
+from epigauge._results import Result
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.labels import image_sizes, point_colours, view_names
+
+if TYPE_CHECKING:
+    from epigauge.io._common import PathLike
 
 __all__ = ["Reconstruction", "Tracks"]
 
@@ -25,7 +30,7 @@ MIN_POINTS, MIN_VIEWS = 6, 2
 MIN_SIZE, MAX_SIZE = 1e-100, 1e100
 
 
-class Tracks:
+class Tracks(Result):
     """Observations: point `point[k]` is measured at `xy[k]` in view `view[k]`.
 
     Parameters
@@ -221,6 +226,36 @@ class Tracks:
     def __repr__(self) -> str:
         return f"Tracks({self.n_views} views, {self.n_points} points, {len(self)} observations)"
 
+    def save(self, path: PathLike, **more: Any) -> None:
+        """Write them in a form that `load_tracks` reads.
+
+        Parameters
+        ----------
+        path : str or path
+            As for `save_tracks`: ``.npz`` or ``.csv``.
+        **more
+            Of `save_tracks`: `start`.
+
+        Examples
+        --------
+        >>> eg.multi_view_scene().tracks.save("tracks.csv")  # doctest: +SKIP
+        """
+        from epigauge.io import save_tracks
+
+        save_tracks(path, self, **more)
+
+    def _contents(self) -> dict[str, Any]:
+        names = ("n_views", "n_points", "view", "point", "xy", "weights", "names", "sizes")
+        return {name: getattr(self, name) for name in (*names, "colours")}
+
+    def _summary_rows(self) -> dict[str, str]:
+        seen = np.bincount(self.point, minlength=self.n_points)
+        text = f"{seen.min()} to {seen.max()}, {seen.mean():.3g} on the average"
+        return {"views of a point": text}
+
+    def _heading(self) -> str:
+        return repr(self)
+
     def merged(self) -> tuple[Tracks, float]:
         """Put observations of one point in one view together: their mean, with their weights' sum.
 
@@ -346,7 +381,7 @@ def _nearest(
 
 
 @dataclass(frozen=True)
-class Reconstruction:
+class Reconstruction(Result):
     """Cameras and points up to a projective change of basis; scales are free too.
 
     Attributes
@@ -363,6 +398,12 @@ class Reconstruction:
     def __post_init__(self) -> None:
         object.__setattr__(self, "P", _homogeneous("P", self.P, (3, 4)))
         object.__setattr__(self, "Q", _homogeneous("Q", self.Q, (4,)))
+
+    def _heading(self) -> str:
+        return f"Reconstruction: {len(self.P)} views, {len(self.Q)} points"
+
+    def _summary_rows(self) -> dict[str, str]:
+        return {"cameras": "projective, known up to a change of basis"}
 
     def project(self, tracks: Tracks) -> Array:
         """Return the predicted pixels of all observations.

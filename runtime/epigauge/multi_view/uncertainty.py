@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
 from epigauge._arguments import as_choice, as_positive
+from epigauge._results import Result
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.priors import Prior
@@ -44,7 +45,7 @@ _DENSE = 5000
 
 
 @dataclass(frozen=True, eq=False)
-class ReconstructionCovariance:
+class ReconstructionCovariance(Result):
     """Covariances of cameras, points and projected points, to first order in the noise.
 
     Attributes
@@ -66,6 +67,19 @@ class ReconstructionCovariance:
     _inverse: Inverse | Sandwich
     _maps: tuple[Array, Array]
     _wander: Array | None = None
+
+    def _contents(self) -> dict[str, Any]:
+        names = ("noise_px", "reconstruction", "cameras", "points", "projections")
+        return {name: getattr(self, name) for name in names}
+
+    def _summary_rows(self) -> dict[str, str]:
+        spread = np.sqrt(0.5 * np.einsum("nii->n", self.projections))
+        middle, most = (f"{f(spread):.4g}" for f in (np.median, np.max))
+        return {
+            "noise_px": f"{self.noise_px:.6g}",
+            "cameras, points": f"{len(self.reconstruction.P)} and {len(self.reconstruction.Q)}",
+            "deviation of projections": f"{middle} px in the median, {most} px at most",
+        }
 
     def in_gauge(self, gauge: Gauge) -> ReconstructionCovariance:
         """Return the covariance in another gauge; nothing large is computed again.

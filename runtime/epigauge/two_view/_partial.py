@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any, Self
+
+from epigauge._results import Result
 
 __all__ = ["Partial"]
 
 
-class Partial:
+class Partial(Result):
     """Base of a dataclass whose instances may start with some of their fields only."""
 
     @classmethod
@@ -59,5 +62,5 @@ class Partial:
             self.__dict__.setdefault(field, value)
 
     def __getstate__(self) -> dict[str, Any]:
-        fields = type(self).__dataclass_fields__  # type: ignore[attr-defined]
-        return {name: getattr(self, name) for name in fields}
+        own: Any = self
+        return {field.name: getattr(self, field.name) for field in fields(own)}

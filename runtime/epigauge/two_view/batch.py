@@ -81,6 +81,25 @@ class FundamentalBatch(Partial):
         """Return the number of pairs."""
         return len(self.F)
 
+    def _arrays(self) -> dict[str, Any]:
+        reasons = [self.reasons.get(k, "") for k in range(len(self))]
+        flags = ["; ".join(names) for names in self.flags]
+        return self._contents() | {"reasons": reasons, "flags": flags}
+
+    def _heading(self) -> str:
+        return f"FundamentalBatch: {len(self)} pairs"
+
+    def _summary_rows(self) -> dict[str, str]:
+        done, refused = self.status > 0, len(self.reasons)
+        rows = {"converged": f"{np.count_nonzero(done)} of {len(self)}", "refused": str(refused)}
+        if done.any():
+            rows["median rms_px"] = f"{np.median(self.rms_px[done]):.6g}"
+            rows["median nfev"] = f"{np.median(self.nfev[done]):g}"
+        return rows
+
+    def _explained(self) -> dict[str, str]:
+        return {f"pair {k}": reason for k, reason in list(self.reasons.items())[:5]}
+
 
 def refine_fundamental_batch(
     x1: ArrayLike,

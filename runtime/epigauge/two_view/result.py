@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from epigauge import verdicts
 from epigauge.errors import ArgumentError
@@ -16,6 +17,9 @@ from epigauge.two_view.covariance import Uncertainty
 from epigauge.two_view.diagnostics import diagnose
 from epigauge.two_view.evidence import Evidence
 from epigauge.two_view.minima import Minimum
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["FundamentalResult"]
 
@@ -103,6 +107,11 @@ class FundamentalResult(Partial):
         from that than three standard deviations, as points nearly at infinity do.
     """
 
+    _shown: ClassVar[tuple[str, ...]] = (
+        *("F", "sigma", "rms_px", "noise_px", "rank", "condition"),
+        *("E", "R", "t", "in_front", "nfev", "message"),
+    )
+
     F: Array
     U: Array
     V: Array
@@ -138,6 +147,34 @@ class FundamentalResult(Partial):
     in_front: int | None
     _uncertainty: Uncertainty = field(repr=False)
     _evidence: Evidence = field(repr=False)
+
+    def plot(self, x1: ArrayLike, x2: ArrayLike, **options: Any) -> Figure:
+        """Draw the matches with their distances, epipolar lines and the convergence.
+
+        Parameters
+        ----------
+        x1, x2 : array_like, shape (m, 2)
+            The matches that the result was computed from; those of `used` of a `RobustResult`.
+        **options
+            Of `epigauge.plots.plot_refinement`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            The picture; `epigauge.plots.save_figure` writes it.
+
+        Raises
+        ------
+        MissingPackageError
+            If Matplotlib is not installed.
+
+        Examples
+        --------
+        >>> result.plot(x1, x2)  # doctest: +SKIP
+        """
+        from epigauge.plots import plot_refinement
+
+        return plot_refinement(self, x1, x2, **options)
 
     @property
     def epipole1(self) -> Array:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -75,11 +75,25 @@ class RobustResult(FundamentalResult):
         it found nothing.
     """
 
+    _shown: ClassVar[tuple[str, ...]] = (
+        *("F", "inliers", "threshold_px", "sigma", "rms_px", "noise_px", "rank", "condition"),
+        *("E", "R", "t", "in_front", "start", "message"),
+    )
+
     inlier: Mask = field(repr=False)
     used: NDArray[np.intp] = field(repr=False)
     threshold_px: float
     rounds: int
     start: str
+
+    def __iter__(self) -> Iterator[Array | Mask]:
+        """Unpack as in OpenCV: ``F, mask = eg.estimate_fundamental(x1, x2)``."""
+        return iter((self.F, self.inlier))
+
+    def _summary_rows(self) -> dict[str, str]:
+        found = super()._summary_rows()
+        count = f"{np.count_nonzero(self.inlier)} of {len(self.inlier)} matches"
+        return {"F": found.pop("F"), "inliers": count} | found
 
 
 def estimate_fundamental(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from epigauge import kernels
 from epigauge._arguments import as_positive
+from epigauge._results import Result
 from epigauge.bundle.jobs import Job, metric_job
 from epigauge.bundle.moves import best_conditioned
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
@@ -36,7 +37,7 @@ _POSE = 6
 
 
 @dataclass(frozen=True)
-class Std:
+class Std(Result):
     """Standard deviations.
 
     Attributes
@@ -57,7 +58,7 @@ class Std:
 
 
 @dataclass(frozen=True, eq=False)
-class MetricCovariance:
+class MetricCovariance(Result):
     """Covariances of a calibrated reconstruction in a datum.
 
     A view has six numbers: its small rotation about the axes of the scene (radians), and its
@@ -89,6 +90,18 @@ class MetricCovariance:
     _projection: Projection
     _home: Similarity
     _rows: tuple[Array, Array]
+
+    def _contents(self) -> dict[str, Any]:
+        known = {name: getattr(self, name) for name in ("noise_px", "redundancy", "open")}
+        gauge = self.gauge if isinstance(self.gauge, str) else type(self.gauge).__name__
+        return known | {"gauge": gauge, "reconstruction": self.reconstruction, "std": self.std}
+
+    def _summary_rows(self) -> dict[str, str]:
+        known, std = self._contents(), self.std
+        rows = {name: f"{known[name]}" for name in ("redundancy", "gauge", "open")}
+        for name, unit in (("rotations", "rad"), ("centres", "units"), ("points", "units")):
+            rows[f"std of {name}"] = f"{np.median(getattr(std, name)):.4g} {unit} in the median"
+        return {"noise_px": f"{self.noise_px:.6g}"} | rows
 
     def in_gauge(self, gauge: Any) -> MetricCovariance:
         """Return the covariance in another datum, from the same inverse.
