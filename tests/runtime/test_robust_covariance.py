@@ -9,7 +9,6 @@ import many_views
 import numpy as np
 import pytest
 from epigauge import kernels
-from epigauge.multi_view.sandwich import RobustFit
 from epigauge.two_view.covariance import (
     influence,
     residual_noise,
@@ -17,6 +16,7 @@ from epigauge.two_view.covariance import (
     untruncated,
 )
 from epigauge.two_view.losses import Loss
+from epigauge.uncertainty.influence import RobustFit
 from two_views import Array, normalizing
 
 #: Share of wrong matches, and how far off they are in standard deviations of the right ones.

@@ -28,7 +28,7 @@ def linearizer_for(
     loss: Loss,
     workers: int = 1,
     ties: Ties | None = None,
-    stretch: NDArray[np.float64] | None = None,
+    whitening: Array | None = None,
 ) -> Linearizer:
     """Return what evaluates observations of cameras of a model.
 
@@ -50,10 +50,10 @@ def linearizer_for(
         Threads to use where the back end can.
     ties : Ties, optional
         What own tangents are made of: entries of a camera's that are always zero need no work.
-    stretch : ndarray, shape (2, N), optional
-        Factors of a residual's coordinates; the compiled evaluation knows none.
+    whitening : ndarray, shape (2, 2, N), optional
+        What residuals are multiplied by; the compiled evaluation knows none.
     """
-    if kernels.compiled and stretch is None:
+    if kernels.compiled and whitening is None:
         used = None if ties is None else ties.used
         return NativeLinearizer(model, graph, q, weights, loss, workers, used)
-    return NumpyLinearizer(model, kernels, graph, q, weights, loss, stretch)
+    return NumpyLinearizer(model, kernels, graph, q, weights, loss, whitening)

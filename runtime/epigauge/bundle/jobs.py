@@ -56,8 +56,8 @@ class Job:
         What is known beside the images.
     fixes_gauge : bool
         Whether something fixed or known ties the reconstruction to its frame.
-    stretch : ndarray, shape (2, N), or None
-        Factors of the two coordinates of a residual, where they are not measured alike.
+    whitening : ndarray, shape (2, 2, N), or None
+        What residuals are multiplied by, where their coordinates are not measured alike.
     """
 
     model: CameraModel
@@ -69,7 +69,7 @@ class Job:
     freedom: Freedom = field(default_factory=Freedom)
     priors: Priors | None = None
     fixes_gauge: bool = False
-    stretch: Array | None = None
+    whitening: Array | None = None
 
 
 def job_of(
@@ -166,7 +166,7 @@ def uncalibrated_job(
         whole_freedom(model, len(rows), len(points), views, held),
         None,
         bool(len(views) + len(held)),
-        tracks.stretch,
+        tracks.whitening,
     )
 
 
@@ -210,7 +210,7 @@ def metric_job(
         refined_freedom(start, refine, views, points, listed),
         known if len(known) else None,
         bool(len(views) + len(points) + len(known) - len(known.cameras)),
-        tracks.stretch,
+        tracks.whitening,
     )
 
 

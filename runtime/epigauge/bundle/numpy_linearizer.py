@@ -12,6 +12,7 @@ from epigauge.bundle.linearizer import LEAST_WEIGHT, Normal, PointRefinement, po
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.cameras import CameraModel
 from epigauge.kernels import Table
+from epigauge.multi_view.measured import whitened
 from epigauge.two_view.losses import Loss
 
 __all__ = ["NumpyLinearizer", "inverse_roots", "normal_equations"]
@@ -48,8 +49,8 @@ class NumpyLinearizer:
         Factor of each squared residual.
     loss : Loss
         Applied to each squared residual.
-    stretch : ndarray, shape (2, N), or None
-        Factors of a residual's coordinates, where they are not measured alike.
+    whitening : ndarray, shape (2, 2, N), or None
+        What residuals are multiplied by, where their coordinates are not measured alike.
     """
 
     model: CameraModel
@@ -58,7 +59,7 @@ class NumpyLinearizer:
     q: Array
     weights: Array
     loss: Loss
-    stretch: Array | None = None
+    whitening: Array | None = None
 
     def with_loss(self, loss: Loss) -> NumpyLinearizer:
         """Return the same observations with another loss."""
@@ -73,15 +74,13 @@ class NumpyLinearizer:
     def observe(self, cameras: Array, points: Array) -> tuple[Array, Array, Array]:
         """Return r (2, N), and the Jacobians of q_hat by camera (2, d, N) and point (2, b, N).
 
-        All are stretched.
+        All are whitened.
         """
         observe = self._kernel("observe")
         with np.errstate(**_QUIET):
             r, J_camera, J_point = observe(*self._gathered(cameras, points), self.q)
-            if self.stretch is not None:
-                each = self.stretch[:, None]
-                r, J_camera, J_point = self.stretch * r, each * J_camera, each * J_point
-        return r, J_camera, J_point
+            found = tuple(whitened(self.whitening, part) for part in (r, J_camera, J_point))
+        return found[0], found[1], found[2]
 
     def log_depths(self, cameras: Array, points: Array) -> tuple[Array, Array]:
         """Return Z = d log depth by camera (d, N) and point (b, N)."""
@@ -94,7 +93,7 @@ class NumpyLinearizer:
         """Return the weighted robust sum of each point, (m,); not finite in a focal plane."""
         with np.errstate(**_QUIET):
             r = self.residuals(cameras, points)
-            return self._costs(r if self.stretch is None else self.stretch * r)[0]
+            return self._costs(whitened(self.whitening, r))[0]
 
     def distances(self, cameras: Array, points: Array) -> Array:
         """Return the distance of each observation to its projected point, (N,), in any order."""

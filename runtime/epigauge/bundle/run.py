@@ -57,7 +57,7 @@ def bundle_problem(
     *,
     embedded: bool = False,
     workers: int = 1,
-    stretch: Array | None = None,
+    whitening: Array | None = None,
     **parts: Any,
 ) -> BundleProblem:
     """Return the problem of cameras of a model.
@@ -78,8 +78,8 @@ def bundle_problem(
         Re-triangulate the points after each step.
     workers : int
         Threads to use where the back end can.
-    stretch : ndarray, shape (2, N), optional
-        Factors of the two coordinates of a residual.
+    whitening : ndarray, shape (2, 2, N), optional
+        What residuals are multiplied by.
     **parts
         Other parts of a `BundleProblem`: freedom, priors.
     """
@@ -88,7 +88,7 @@ def bundle_problem(
     ties = parts["freedom"].ties if "freedom" in parts else None
     return BundleProblem(
         model,
-        linearizer_for(model, kernels, graph, q, weights, loss or Loss(), workers, ties, stretch),
+        linearizer_for(model, kernels, graph, q, weights, loss or Loss(), workers, ties, whitening),
         lambda cameras, own: np.ascontiguousarray(retract(cameras.T, own.T).T),
         refinement=how if embedded else None,
         floor=0.5 * float(np.sum(weights * (_ROUNDING * q) ** 2)),
@@ -205,7 +205,7 @@ def minimized(
                 strategy, explicit, job.model, kernels, cameras, chosen, job.freedom
             ),
             priors=priors,
-            stretch=job.stretch,
+            whitening=job.whitening,
         )
         # Points jump alike whatever the basis, but only in the one chosen here: in no gauge.
         jumps = homogeneous and problem.refinement is not None and gauge is None

@@ -139,5 +139,8 @@ def _with(tracks: Tracks, xy: Array, **labels: Any) -> Tracks:
         min_points=1,
         **labels,
     )
-    made.unit, made.stretch = tracks.unit, tracks.stretch
+    made.unit, made.whitening = tracks.unit, tracks.whitening
+    if made.whitening is not None:  # y is counted the other way
+        turn = np.array([1.0, -1.0])
+        made.whitening = turn[:, None, None] * made.whitening * turn[:, None]
     return made

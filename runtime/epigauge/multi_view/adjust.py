@@ -24,6 +24,7 @@ from epigauge.cameras import AffineReconstruction, MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.gauge import Gauge
 from epigauge.multi_view.initialize import initialize
+from epigauge.multi_view.measured import whitened
 from epigauge.multi_view.prior_noise import with_estimated_noise
 from epigauge.multi_view.rejection import without_gross_errors
 from epigauge.multi_view.repeated import merging_sightings
@@ -440,5 +441,6 @@ def _loss_scale(
         return 0.0
     if loss_scale_px != "auto":
         return as_positive("loss_scale_px", loss_scale_px)
-    distances = np.linalg.norm(tracks.xy - start.project(tracks), axis=1)
+    residuals = whitened(tracks.whitening, (tracks.xy - start.project(tracks)).T)
+    distances = np.linalg.norm(residuals, axis=0)
     return EFFICIENT[loss] * max(robust_scale(distances[tracks.weights > 0.0]), 1e-12)

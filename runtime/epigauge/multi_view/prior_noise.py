@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from epigauge.multi_view.measured import whitened
 from epigauge.multi_view.tracks import Tracks
 
 if TYPE_CHECKING:
@@ -50,8 +51,8 @@ def with_estimated_noise(
         if found.status == -2:
             break
         start = found.reconstruction
-        residuals = found.fun if tracks.stretch is None else found.fun * tracks.stretch.T
-        squares = float(np.sum(tracks.weights[:, None] * residuals**2))
+        residuals = whitened(tracks.whitening, found.fun.T)
+        squares = float(np.sum(tracks.weights * residuals**2))
         told = max(float(np.sqrt(squares / max(counted - found.rank, 1))), least)
         settled = abs(told - noise_px) <= _SETTLED * noise_px
         noise_px = told

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epigauge._arguments import MAX_PX, MIN_PX, as_array, as_choice, as_double, as_real, as_weights
+from epigauge._arguments import MAX_PX, MIN_PX, as_array, as_choice, as_double, as_weights
 from epigauge._results import Result
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.labels import image_sizes, point_colours, view_names
+from epigauge.multi_view.measured import measured, merged_sums
 
 if TYPE_CHECKING:
     from epigauge.io._common import PathLike
@@ -46,6 +47,8 @@ class Tracks(Result):
     sigma : float or array_like, shape (N,) or (N, 2), optional
         Standard deviation of each measurement, or of its two coordinates, in the unit of `xy`.
         Weights are multiplied by (unit / sigma)^2, and priors count by their own `sigma` beside.
+    covariance : array_like, shape (2, 2) or (N, 2, 2), optional
+        Covariance of the two coordinates of each measurement instead, in the unit squared.
     names : sequence of str, optional
         Names of the views, as those of their files; all different.
     sizes : array_like of int, shape (n_views, 2), optional
@@ -64,10 +67,11 @@ class Tracks(Result):
     view, point, xy, weights : ndarray
         The same, sorted by point, then view; read-only. The weights include `sigma`.
     unit : float
-        Standard deviation of a coordinate of weight one: the median of `sigma`; 1 without.
-    stretch : ndarray, shape (2, N), or None
-        Factors of the two coordinates of a residual beside its weight, of product one; None where
-        both are measured alike.
+        Standard deviation of a coordinate of weight one: the median of `sigma`, or of the fourth
+        roots of the determinants of `covariance`; 1 without.
+    whitening : ndarray, shape (2, 2, N), or None
+        What a residual is multiplied by beside its weight, matrices of determinant one; None where
+        both coordinates are measured alike.
     names, sizes, colours, source
         As given, or None.
     order : ndarray of int, shape (N,)
@@ -94,6 +98,7 @@ class Tracks(Result):
         weights: ArrayLike | None = None,
         *,
         sigma: ArrayLike | None = None,
+        covariance: ArrayLike | None = None,
         names: Sequence[str] | None = None,
         sizes: ArrayLike | None = None,
         colours: ArrayLike | None = None,
@@ -125,9 +130,9 @@ class Tracks(Result):
         self.point: Indices = points[self.order]
         self.xy: Array = np.ascontiguousarray(pixels[self.order])
         w = np.ones(len(views)) if weights is None else as_weights(weights, len(views))
-        self.unit, factors, stretch = _measured(sigma, len(views))
+        self.unit, factors, whitening = measured(sigma, covariance, len(views))
         self.weights: Array = (w * factors)[self.order]
-        self.stretch: Array | None = None if stretch is None else stretch[:, self.order]
+        self.whitening: Array | None = None if whitening is None else whitening[:, :, self.order]
         self.source = source
         self.n_repeated = int(self._again().sum())
         self._check(repeated, min_points)
@@ -257,7 +262,7 @@ class Tracks(Result):
         return repr(self)
 
     def merged(self) -> tuple[Tracks, float]:
-        """Put observations of one point in one view together: their mean, with their weights' sum.
+        """Put observations of one point in one view together: their mean by their information.
 
         Returns
         -------
@@ -269,18 +274,10 @@ class Tracks(Result):
         """
         if not self.n_repeated:
             return self, 0.0
-        if self.stretch is not None:
-            was = "differs between x and y where a point is seen several times in one view"
-            raise ArgumentError("sigma", was, "one number an observation")
         first = np.flatnonzero(~self._again())
-        count = np.diff([*first, len(self)])
-        weights = np.add.reduceat(self.weights, first)
-        # Weights of zero, if all of a place are, leave the plain mean.
-        shares = np.where(np.repeat(weights == 0.0, count), 1.0, self.weights)
-        xy = np.add.reduceat(shares[:, None] * self.xy, first)
-        xy /= np.add.reduceat(shares, first)[:, None]
-        away = self.xy - np.repeat(xy, count, axis=0)
-        constant = 0.5 * float(self.weights @ np.sum(away**2, axis=1))
+        alike = np.repeat(np.eye(2)[:, :, None], len(self), 2)
+        W = alike if self.whitening is None else self.whitening
+        xy, weights, whitening, constant = merged_sums(first, self.xy, self.weights, W)
         tracks = Tracks(
             self.view[first],
             self.point[first],
@@ -294,6 +291,7 @@ class Tracks(Result):
             min_points=1,
         )
         tracks.unit = self.unit
+        tracks.whitening = None if self.whitening is None else whitening
         return tracks, constant
 
     def _again(self) -> NDArray[np.bool_]:
@@ -466,23 +464,6 @@ def _indices(name: str, value: ArrayLike) -> Indices:
     if len(bad):
         raise ArgumentError(name, f"is {indices[bad[0]]} in row {bad[0]}", "indices from 0")
     return indices.astype(np.intp)
-
-
-def _measured(sigma: ArrayLike | None, count: int) -> tuple[float, Array, Array | None]:
-    """Return the unit of weight, the factors of weights (N,), and of coordinates (2, N) or None."""
-    if sigma is None:
-        return 1.0, np.ones(count), None
-    array = as_real("sigma", sigma, "a number, (N,) or (N, 2)")
-    if array.shape not in ((), (count,), (count, 2)):
-        raise ArgumentError("sigma", f"has shape {array.shape}", f"({count},) or ({count}, 2)")
-    both = np.broadcast_to(array if array.ndim == 2 else array.reshape(-1, 1), (count, 2))
-    bad = np.flatnonzero(~((both > 0.0) & np.isfinite(both)).all(axis=1))
-    if len(bad):
-        raise ArgumentError("sigma", f"is {both[bad[0]]} in row {bad[0]}", "positive numbers")
-    unit = float(np.median(both))
-    mean = np.sqrt(both[:, 0] * both[:, 1])
-    alike = bool((both[:, 0] == both[:, 1]).all())
-    return unit, (unit / mean) ** 2, None if alike else np.ascontiguousarray(mean / both.T)
 
 
 def _extent(name: str, indices: Indices, given: int | None) -> int:

@@ -30,10 +30,13 @@ from epigauge.multi_view.datum import Projector, halves, mapped, projector
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import Gauge, identity, normalized, two_cameras
 from epigauge.multi_view.inverse import Inverse
-from epigauge.multi_view.sandwich import RobustFit, Sandwich
+from epigauge.multi_view.measured import whitened
+from epigauge.multi_view.sandwich import Sandwich
 from epigauge.multi_view.tracks import Reconstruction, Tracks
-from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
-from epigauge.uncertainty.covariance import MetricCovariance, metric_covariance
+from epigauge.two_view.losses import LOSSES, Loss
+from epigauge.uncertainty.covariance import MetricCovariance
+from epigauge.uncertainty.influence import Influence, RobustFit
+from epigauge.uncertainty.metric import metric_covariance, robust_loss
 
 __all__ = ["ReconstructionCovariance", "covariance"]
 
@@ -262,6 +265,8 @@ def covariance(
     gauge: Any = None,
     noise_px: float | None = None,
     *,
+    loss: str = "linear",
+    loss_scale_px: float | str = "auto",
     refine: str | Sequence[str] = "all",
     fixed_views: Iterable[int] = (),
     fixed_points: Iterable[int] = (),
@@ -303,7 +308,7 @@ def covariance(
         Standard deviation of an image coordinate of weight one. By default estimated from the
         residuals: sqrt(sum of weighted squares / (2 N - 11 n - 3 m + 15)), with a robust loss over
         those within three standard deviations, freed from the pull of the others
-        (`epigauge.multi_view.sandwich.RobustFit`). Priors count beside this noise; where it is
+        (`epigauge.uncertainty.influence.RobustFit`). Priors count beside this noise; where it is
         estimated, beside the `sigma` of the tracks, and the variance factor is that of all.
     loss : {"linear", "huber", "soft_l1", "cauchy", "truncated"}
         What the reconstruction was adjusted with. Under a robust loss the covariance is that of an
@@ -341,11 +346,9 @@ def covariance(
         was = f"is a {type(reconstruction).__name__}"
         raise ArgumentError("reconstruction", was, "an eg.Reconstruction or MetricReconstruction")
     if isinstance(reconstruction, MetricReconstruction):
-        if loss != "linear":
-            needed = "'linear'; give observations that were set aside weight zero"
-            raise ArgumentError("loss", f"is {loss!r:.60} for a metric reconstruction", needed)
         datum = "inner" if gauge is None else gauge
         options: Any = {**of_metric, "backend": backend}
+        options |= {"loss": loss, "loss_scale_px": loss_scale_px}
         return metric_covariance(tracks, reconstruction, datum, noise_px, **options)
     if of_metric:
         raise ArgumentError(
@@ -365,11 +368,12 @@ def covariance(
     table, q = kernels.table(backend), frame.conditioned(tracks)
     found, weights = None, np.asarray(tracks.weights)
     if as_choice("loss", loss, LOSSES) != "linear":
-        robust = _robust(tracks, reconstruction, loss, loss_scale_px)
-        found = RobustFit.of(*robust, 11 * n + 3 * m - 15)
+        r = whitened(tracks.whitening, (tracks.xy - reconstruction.project(tracks)).T).T
+        known = robust_loss(loss, loss_scale_px, r, weights)
+        found = RobustFit.of(r, weights, known, 11 * n + 3 * m - 15)
         weights = found.weights
     parts = camera_model("projective"), table, graph, q, weights
-    linearizer = NumpyLinearizer(*parts, Loss())
+    linearizer = NumpyLinearizer(*parts, Loss(), tracks.whitening)
     moved_P, moved_Q = home.apply(frame.cameras_in(P), Q)
     state = moved_P.reshape(-1, 12), moved_Q
     cost = 0.5 * float(np.sum(linearizer.point_costs(*state)))
@@ -383,7 +387,7 @@ def covariance(
     inverse = Inverse.of(linearizer, state, frame.scale)
     whole: Inverse | Sandwich = inverse
     if found is not None:
-        influence = found.influence(inverse.pull(found.wrong, found.psi))
+        influence = _influence(found, inverse, tracks.whitening)
         noise_px = influence.noise if noise_px is None else noise_px
         whole = Sandwich(inverse, influence)
     assert noise_px is not None
@@ -400,12 +404,12 @@ def covariance(
     return free if gauge is None else free.in_gauge(gauge)
 
 
-def _robust(
-    tracks: Tracks, reconstruction: Reconstruction, loss: str, loss_scale_px: float | str
-) -> tuple[Array, Array, Loss]:
-    """Return residuals and weights in pixels, and the loss."""
-    r, weights = tracks.xy - reconstruction.project(tracks), np.asarray(tracks.weights)
-    if loss_scale_px == "auto":
-        scale = robust_scale(np.linalg.norm(r, axis=1)[weights > 0.0])
-        return r, weights, Loss(loss, EFFICIENT[loss] * max(scale, 1e-12))
-    return r, weights, Loss(loss, as_positive("loss_scale_px", loss_scale_px))
+def _influence(fit: RobustFit, inverse: Inverse, whitening: Array | None) -> Influence:
+    """Return what observations add, in pixels: the fit is of whitened residuals."""
+    if whitening is None:
+        return fit.influence(inverse.pull(fit.wrong, fit.psi))
+    W = whitening.transpose(2, 0, 1)[fit.wrong]
+    psi = (np.swapaxes(W, 1, 2) @ fit.psi[..., None])[..., 0]
+    influence = fit.influence(whitened(whitening, inverse.pull(fit.wrong, psi).T).T)
+    W = whitening.transpose(2, 0, 1)[influence.wrong]
+    return replace(influence, rest=np.swapaxes(W, 1, 2) @ influence.rest @ W)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -10,25 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge import kernels
-from epigauge._arguments import as_positive
 from epigauge._results import Result
-from epigauge.bundle.jobs import Job, metric_job
-from epigauge.bundle.moves import best_conditioned
-from epigauge.bundle.numpy_linearizer import NumpyLinearizer
-from epigauge.bundle.observations import ObservationGraph
-from epigauge.bundle.priors import Prior
-from epigauge.bundle.problem import Estimate
-from epigauge.bundle.run import bundle_problem
 from epigauge.bundle.similarity import Similarity
 from epigauge.cameras import MetricReconstruction
 from epigauge.errors import ArgumentError
-from epigauge.multi_view.tracks import Tracks
-from epigauge.two_view.losses import Loss
 from epigauge.uncertainty.datum import Projection, projection
-from epigauge.uncertainty.inverse import Inverse
+from epigauge.uncertainty.inverse import Inverse, Part
+from epigauge.uncertainty.sandwich import Sandwich
 
-__all__ = ["MetricCovariance", "Std", "metric_covariance"]
+__all__ = ["MetricCovariance", "Std"]
 
 Array = NDArray[np.float64]
 
@@ -71,7 +61,8 @@ class MetricCovariance(Result):
         The estimate.
     noise_px : float
         Standard deviation of an image coordinate of weight one (in the unit of the tracks): given,
-        or estimated as sqrt(sum of weighted squares / redundancy), priors included.
+        or estimated as sqrt(sum of weighted squares / redundancy), priors included; under a robust
+        loss from the right observations alone.
     redundancy : int
         Observations and priors beyond what the unknowns need.
     gauge : object
@@ -86,7 +77,7 @@ class MetricCovariance(Result):
     redundancy: int
     gauge: Any
     open: int
-    _inverse: Inverse
+    _inverse: Inverse | Sandwich
     _projection: Projection
     _home: Similarity
     _rows: tuple[Array, Array]
@@ -183,15 +174,8 @@ class MetricCovariance(Result):
             On parts that do not exist.
         """
         first, second = self._part("a", a), self._part("b", b)
-        if first.view is None and second.view is None:
-            block = self._inverse.pair(first.index, second.index)
-        elif first.view is None:
-            block = self._inverse.cross(first.index)[second.view].T
-        elif second.view is None:
-            block = self._inverse.cross(second.index)[first.view]
-        else:
-            block = self._inverse.cameras[first.view, :, second.view]
-        block = block + self._low(first) @ self._middle @ self._low(second).T
+        block = self._inverse.block(first.part, second.part)
+        block = block + self._low(first) @ self._projection.M @ self._low(second).T
         return np.asarray(self.noise_px**2 * first.out @ block @ second.out.T)
 
     def joint(self, parts: Sequence[tuple[str, int]]) -> Array:
@@ -299,8 +283,9 @@ class MetricCovariance(Result):
 
     def _length(self, i: int, j: int) -> tuple[float, Array]:
         """Return the distance of two points, and its derivatives (6,)."""
-        a, b = self._part("i", ("point", i)).index, self._part("j", ("point", j)).index
-        apart = self.reconstruction.X[a] - self.reconstruction.X[b]
+        for name, index in (("i", i), ("j", j)):
+            self._part(name, ("point", index))
+        apart = self.reconstruction.X[i] - self.reconstruction.X[j]
         length = float(np.linalg.norm(apart))
         if not length > 0.0:
             raise ArgumentError("i, j", f"are at one place ({i}, {j})", "points apart")
@@ -313,18 +298,17 @@ class MetricCovariance(Result):
     @cached_property
     def std(self) -> Std:
         """Return the standard deviations of everything."""
-        n, d = self._inverse.cameras.shape[:2]
-        low, middle = self._columns, self._middle
-        blocks = self._inverse.cameras[np.arange(n), :, np.arange(n)]
-        blocks = blocks + np.einsum("ndq,qr,ner->nde", low[0], middle, low[0], optimize=True)
+        d = self._inverse.sizes[1]
+        low, middle = self._projection, self._projection.M
+        blocks, points = self._inverse.diagonals
+        blocks = blocks + low.cameras @ middle @ np.swapaxes(low.cameras, 1, 2)
+        points = points + low.points @ middle @ np.swapaxes(low.points, 1, 2)
         poses = (
             self.noise_px**2
             * self._poses
             @ blocks[:, :_POSE, :_POSE]
             @ np.swapaxes(self._poses, 1, 2)
         )
-        points = self._inverse.points
-        points = points + np.einsum("mdq,qr,mer->mde", low[1], middle, low[1], optimize=True)
         turned = self._space @ points @ self._space.T
         cameras = self.reconstruction.cameras
         first = np.unique(cameras.camera_of_view, return_index=True)[1]
@@ -338,22 +322,6 @@ class MetricCovariance(Result):
             np.sqrt(np.maximum(own, 0.0)),
             of_points,
         )
-
-    @cached_property
-    def _columns(self) -> tuple[Array, Array]:
-        """L of what is added to X_0: known distances, and the datum."""
-        return (
-            np.concatenate([self._inverse.L_cameras, self._projection.cameras], axis=2),
-            np.concatenate([self._inverse.L_points, self._projection.points], axis=2),
-        )
-
-    @cached_property
-    def _middle(self) -> Array:
-        first, second = self._inverse.M, self._projection.M
-        whole = np.zeros((len(first) + len(second),) * 2)
-        whole[: len(first), : len(first)] = first
-        whole[len(first) :, len(first) :] = second
-        return whole
 
     @cached_property
     def _poses(self) -> Array:
@@ -371,8 +339,9 @@ class MetricCovariance(Result):
         return np.asarray(self._home.rotation.T / self._home.scale)
 
     def _low(self, part: _Part) -> Array:
+        view, point = part.part
         return np.asarray(
-            self._columns[1][part.index] if part.view is None else self._columns[0][part.view]
+            self._projection.cameras[view] if point is None else self._projection.points[point]
         )
 
     def _part(self, name: str, value: Any) -> _Part:
@@ -393,96 +362,17 @@ class MetricCovariance(Result):
             raise ArgumentError(name, f"is {value!r:.60}", f"{kind} 0 to {count - 1}")
         index = int(index)
         if kind == "point":
-            return _Part(None, index, self._space)
-        d = self._inverse.cameras.shape[1]
+            return _Part((None, index), self._space)
+        d = self._inverse.sizes[1]
         if kind == "camera":
-            return _Part(index, index, np.pad(self._poses[index], ((0, 0), (0, d - _POSE))))
+            return _Part((index, None), np.pad(self._poses[index], ((0, 0), (0, d - _POSE))))
         first = int(np.argmax(cameras.camera_of_view == index))
-        return _Part(first, index, np.eye(d)[_POSE:])
+        return _Part((first, None), np.eye(d)[_POSE:])
 
 
 @dataclass(frozen=True)
 class _Part:
-    """A view (or the first of a camera) or a point, and what own tangents are multiplied by."""
+    """A part of the inverse, and what its own tangents are multiplied by."""
 
-    view: int | None
-    index: int
+    part: Part
     out: Array
-
-
-def metric_covariance(
-    tracks: Tracks,
-    reconstruction: MetricReconstruction,
-    gauge: Any = "inner",
-    noise_px: float | None = None,
-    *,
-    refine: str | Sequence[str] = "all",
-    fixed_views: Iterable[int] = (),
-    fixed_points: Iterable[int] = (),
-    priors: Iterable[Prior] | None = None,
-    backend: str | None = None,
-) -> MetricCovariance:
-    """Return the covariance of an adjusted calibrated reconstruction; see `eg.covariance`."""
-    tracks = tracks.merged()[0]
-    if noise_px is not None:
-        noise_px = as_positive("noise_px", noise_px)
-    job = metric_job(
-        tracks,
-        reconstruction,
-        refine=refine,
-        fixed_views=tuple(fixed_views),
-        fixed_points=tuple(fixed_points),
-        priors=priors,
-        noise_px=tracks.unit if noise_px is None else noise_px,
-    )
-    table = kernels.table(backend)
-    graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
-    home = best_conditioned(job.model, job.cameras, job.points)
-    assert isinstance(home, Similarity)
-    cameras, points = home.apply(job.cameras, job.points)
-    priors_there = None if job.priors is None else job.priors.moved(home)
-    weights = np.asarray(tracks.weights)
-    problem = bundle_problem(
-        job.model,
-        table,
-        graph,
-        job.q,
-        weights,
-        Loss(),
-        freedom=job.freedom,
-        priors=priors_there,
-        stretch=job.stretch,
-    )
-    state = problem.evaluate(Estimate(cameras, points))
-    system = problem.linearize(state)
-    reference = NumpyLinearizer(job.model, table, graph, job.q, weights, Loss(), job.stretch)
-    inverse = Inverse.of(system, reference, priors_there, table)
-    redundancy = _redundancy(tracks, job, inverse)
-    if noise_px is None:
-        if redundancy <= 0:
-            raise ArgumentError("noise_px", "is not given", "a number: nothing is redundant")
-        noise_px = float(np.sqrt(2.0 * state.cost / redundancy))
-    return MetricCovariance(
-        reconstruction,
-        noise_px,
-        redundancy,
-        gauge,
-        inverse.motions.open.shape[1],
-        inverse,
-        projection(gauge, cameras, points, inverse),
-        home,
-        (cameras, points),
-    )
-
-
-def _redundancy(tracks: Tracks, job: Job, inverse: Inverse) -> int:
-    """Return how many observations and priors there are beyond what the unknowns need."""
-    ties = job.freedom.ties
-    n, m = tracks.n_views, tracks.n_points
-    d = job.model.tangent_size
-    of_views = n * d if ties.A is None else int(np.count_nonzero(ties.A.any(axis=1)))
-    of_points = 3 * m if ties.C is None else int(np.count_nonzero(ties.C.any(axis=1)))
-    observed = 2 * int(np.count_nonzero(tracks.weights > 0.0))
-    known = 0 if job.priors is None else int(job.priors.n_numbers)
-    unknowns = of_views + ties.n_shared + of_points - inverse.motions.open.shape[1]
-    return int(observed + known - unknowns)

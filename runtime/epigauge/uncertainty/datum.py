@@ -22,6 +22,7 @@ from epigauge.multi_view.gauge import (
     two_cameras,
 )
 from epigauge.uncertainty.inverse import Inverse, products
+from epigauge.uncertainty.sandwich import Sandwich
 
 __all__ = ["Datum", "Projection", "projection"]
 
@@ -48,7 +49,9 @@ class Projection:
     M: Array
 
 
-def projection(datum: Any, cameras: Array, points: Array, inverse: Inverse) -> Projection:
+def projection(
+    datum: Any, cameras: Array, points: Array, inverse: Inverse | Sandwich
+) -> Projection:
     """Return what takes the covariance of an `Inverse` to a datum.
 
     Parameters
@@ -57,7 +60,7 @@ def projection(datum: Any, cameras: Array, points: Array, inverse: Inverse) -> P
         Where to.
     cameras, points : ndarray, shape (n, c), (m, 3)
         The estimate.
-    inverse : Inverse
+    inverse : Inverse or Sandwich
         X.
 
     Raises
@@ -70,7 +73,7 @@ def projection(datum: Any, cameras: Array, points: Array, inverse: Inverse) -> P
     G = motions.along(motions.open)
     free = motions.open.shape[1]
     if not free:
-        none = np.zeros((*inverse.cameras.shape[:2], 0)), np.zeros((len(points), 3, 0))
+        none = np.zeros((*inverse.sizes[:2], 0)), np.zeros((len(points), 3, 0))
         return Projection(*none, np.zeros((0, 0)))
     C = _conditions(datum, cameras, points, motions.cameras, motions.points)
     if C[0].shape[2] > free and not _is_inner(datum):

@@ -24,10 +24,13 @@ from epigauge.bundle.ties import Ties
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 
-__all__ = ["Inverse", "Motions", "products"]
+__all__ = ["Inverse", "Motions", "Part", "added_by_priors", "products"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+
+#: A view or a point: the number of one, and None for the other.
+Part = tuple[int | None, int | None]
 
 #: Singular values of what holds the gauge below this, of the largest one, are rounding.
 _FREE = 1e-9
@@ -202,7 +205,8 @@ class Inverse:
         F, G = motions.lifted(system), motions.along(motions.loose)
         back = np.linalg.inv(np.einsum("ndk,ndl->kl", F, G[0]))
         first = motions.open.shape[1]
-        firm = _firm(system, priors, G)
+        alone = added_by_priors(system, priors)
+        firm = alone[0] @ G[0], alone[1] @ G[1]
         weak = plain.apply(firm[0] @ back[:, first:], firm[1] @ back[:, first:])
         XF = G[0] @ back[:, first:] - weak[0], G[1] @ back[:, first:] - weak[1]
         XB = plain.apply(*B)
@@ -225,6 +229,37 @@ class Inverse:
             small = self.M @ products((self.L_cameras, self.L_points), (cameras, points))
             x, y = x + self.L_cameras @ small, y + self.L_points @ small
         return x, y
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers of cameras, of a camera's tangent, and of points."""
+        return (*self.cameras.shape[:2], len(self.V_inverse))
+
+    def block(self, first: Part, second: Part) -> Array:
+        """Return the block of X of two parts."""
+        (i, a), (k, b) = first, second
+        if a is not None and b is not None:
+            found = self.pair(a, b)
+        elif a is not None:
+            found = self.cross(a)[k].T
+        elif b is not None:
+            found = self.cross(b)[i]
+        else:
+            found = self.cameras[i, :, k]
+        return np.asarray(found + self._low(first) @ self.M @ self._low(second).T)
+
+    def _low(self, part: Part) -> Array:
+        return np.asarray(self.L_cameras[part[0]] if part[1] is None else self.L_points[part[1]])
+
+    @cached_property
+    def diagonals(self) -> tuple[Array, Array]:
+        """The diagonal blocks of X of cameras (n, d, d) and points (m, 3, 3)."""
+        n = len(self.cameras)
+        blocks = self.cameras[np.arange(n), :, np.arange(n)], self.points
+        low = self.L_cameras, self.L_points
+        both = (X + L @ self.M @ np.swapaxes(L, 1, 2) for X, L in zip(blocks, low, strict=True))
+        cameras, points = both
+        return cameras, points
 
     @cached_property
     def points(self) -> Array:
@@ -262,15 +297,13 @@ class Inverse:
         return np.asarray(found + (self.V_inverse[i] if i == j else 0.0))
 
 
-def _firm(
-    system: BundleSystem, priors: Priors | None, motions: tuple[Array, Array]
-) -> tuple[Array, Array]:
-    """Return what priors of one view or point add to J^T J, times motions."""
+def added_by_priors(system: BundleSystem, priors: Priors | None) -> tuple[Array, Array]:
+    """Return what priors of one view or point add to J^T J, (n, d, d) and (m, 3, 3)."""
     if priors is None:
-        return np.zeros_like(motions[0]), np.zeros_like(motions[1])
+        return np.zeros_like(system.normal.U), np.zeros_like(system.normal.V)
     zero = {name: np.zeros_like(getattr(system.normal, name)) for name in _SUMS}
     alone = priors.added(replace(system.normal, **zero), system.cameras, system.points)
-    return alone.U @ motions[0], alone.V @ motions[1]
+    return alone.U, alone.V
 
 
 def products(first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
