@@ -96,6 +96,39 @@ def test_a_bal_file_is_a_scene_with_refine_and_tracks_without(run, tmp_path) -> 
     assert (code, len(out.split())) == (0, 4 * 12)
 
 
+def test_a_bal_file_becomes_a_folder_with_the_size_of_its_images(run, tmp_path) -> None:
+    tracks, start = started("bal", n_cameras=4)
+    path = tmp_path / "p.txt"
+    eg.save_scene(path, tracks, start)
+    outputs = "-o", tmp_path / "sparse", "-o", tmp_path / "o.npz"
+    assert run("bundle", path, "--image-size", 1000, 800, *outputs)[0] == 0
+    wanted, found = eg.load_scene(tmp_path / "o.npz"), eg.load_scene(tmp_path / "sparse")
+    assert (wanted[1].cameras.model, found[1].cameras.model) == ("bal", "RADIAL")
+    np.testing.assert_array_equal(found[0].sizes, [[1000, 800]] * 4)
+    np.testing.assert_allclose(found[1].rms_px(found[0]), wanted[1].rms_px(wanted[0]), rtol=1e-9)
+
+
+def test_the_residuals_of_a_scene_are_a_table(run, folder, tmp_path) -> None:
+    assert run("bundle", folder, "-o", tmp_path / "r.csv")[0] == 0
+    tracks, start = eg.load_scene(folder)
+    wanted = eg.bundle_adjust(tracks, start)
+    names, *lines = (tmp_path / "r.csv").read_text().splitlines()
+    assert names == "view,point,x,y,residual_x,residual_y,rejected"
+    rows = [line.split(",") for line in lines]
+    assert [row[0] for row in rows] == [tracks.names[k] for k in tracks.view]
+    numbers = np.array([row[1:6] for row in rows], dtype=float)
+    np.testing.assert_array_equal(numbers[:, 0], tracks.point)
+    np.testing.assert_array_equal(numbers[:, 3:], wanted.fun)
+
+
+@pytest.mark.parametrize("command", ["bundle", "compare"])
+def test_what_does_not_exist_is_said_with_what_may_be_given(run, tmp_path, command) -> None:
+    code, out, err = run(command, tmp_path / "nothere")
+    assert (code, out) == (2, "")
+    for word in ("nothere", "does not exist", ".npz", "COLMAP folder"):
+        assert word in err
+
+
 def test_pictures_show_the_scene_in_its_own_shape(run, folder, tmp_path) -> None:
     pytest.importorskip("matplotlib")
     from epigauge.multi_view.display import display
@@ -128,12 +161,20 @@ def test_pictures_show_the_scene_in_its_own_shape(run, folder, tmp_path) -> None
         (("-o", "nowhere/o"), "nowhere"),
         (("-o", "o.txt"), "colmap_to_bal"),
         (("--rigs", "bent", "-o", "o"), "rigs is 'bent'"),
+        (("--image-size", "640", "480"), "--image-size is given with cameras of the model SIMPLE"),
     ],
 )
 def test_what_a_scene_cannot_have_is_refused_before_the_run(run, folder, options, told) -> None:
     code, out, err = run("bundle", folder, *options)
     assert (code, out) == (2, "")
     assert told in err
+
+
+def test_a_folder_of_a_bal_file_needs_the_size_of_its_images(run, tmp_path) -> None:
+    eg.save_scene(tmp_path / "p.txt", *started("bal", n_cameras=4))
+    code, out, err = run("bundle", tmp_path / "p.txt", "--refine", "pose", "-o", tmp_path / "o")
+    assert (code, out) == (2, "")
+    assert "--image-size is not given" in err
 
 
 def test_a_bad_folder_is_refused_with_file_and_line(run, tmp_path) -> None:

@@ -28,11 +28,12 @@ from epigauge.cli._common import (
     write_json,
 )
 from epigauge.cli._live import watching
+from epigauge.cli._tables import save_residuals
 from epigauge.errors import ArgumentError
 from epigauge.io import SceneSource, load_scene, plain, save_ply, save_scene
 from epigauge.io._npz_scene import write_npz_scene
 from epigauge.io.output import arrays_of_result
-from epigauge.io.scene_files import scene_content
+from epigauge.io.scene_files import is_scene_file, scene_content
 from epigauge.multi_view.display import Display, display
 
 _POINT, _CAMERA = (90, 140, 190), (224, 122, 31)
@@ -50,6 +51,14 @@ FixView = Annotated[
 ]
 Rigs = Annotated[
     str, typer.Option(help="Poses of a COLMAP folder's rigs: keep (they must fit), or drop.")
+]
+ImageSize = Annotated[
+    tuple[int, int] | None,
+    typer.Option(
+        metavar="W H",
+        help="Size of a BAL file's images, for -o FOLDER (COLMAP).",
+        show_default=False,
+    ),
 ]
 
 
@@ -85,9 +94,14 @@ class SceneJob:
         fixed: Sequence[str] = (),
         rigs: str = "keep",
         y_up: bool | None = None,
+        image_size: tuple[int, int] | None = None,
     ) -> None:
-        self.path, self.rigs = path, rigs
+        self.path, self.rigs, self.image_size = path, rigs, image_size
         self.tracks, self.start = load_scene(path)
+        model = self.start.cameras.model
+        if image_size is not None and model != "bal":
+            was = f"is given with cameras of the model {model}"
+            raise ArgumentError("--image-size", was, "a BAL file; others tell the size themselves")
         self.refine: Any = refine or "all"
         if self.refine not in ("all", "pose"):
             self.refine = [name.strip() for name in self.refine.split(",")]
@@ -142,13 +156,24 @@ class SceneJob:
             return INTERRUPTED
         return DONE if result.success else NOT_CONVERGED
 
+    def written(
+        self, path: Path, scene: eg.MetricReconstruction
+    ) -> tuple[eg.Tracks, eg.MetricReconstruction]:
+        """Return a scene as it is written to a path: BAL's in a folder with COLMAP's cameras."""
+        if self.image_size is None or is_scene_file(path):
+            return self.tracks, scene
+        return eg.interop.bal_to_colmap(self.tracks, scene, self.image_size)
+
     def _check_target(self, path: Path) -> None:
         """Check what a run that may be long will write, before it starts."""
         if not path.parent.is_dir():
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
-        if path.suffix.lower() == ".ply":
+        if path.suffix.lower() in (".ply", ".csv"):
             return
-        content = scene_content(path, self.tracks, self.start, self.rigs)
+        if self.start.cameras.model == "bal" and not (self.image_size or is_scene_file(path)):
+            was = "is not given, and a BAL file does not tell it"
+            raise ArgumentError("--image-size", was, "the images' width and height, or -o FILE.npz")
+        content = scene_content(path, *self.written(path, self.start), self.rigs)
         rigs = getattr(content, "rigs", None) or ()
         if any(len(rig.sensors) > 1 for rig in rigs):
             was = "is 'keep', but views are adjusted one by one, so that rigs lose their poses"
@@ -185,7 +210,7 @@ class _SceneAnswer:
         return document | self.more() | {"names": plain(names), "notes": plain(self.job.notes)}
 
     def save(self, path: Path) -> None:
-        """Write the scene with the result, or a cloud of points and centres."""
+        """Write the scene with the result, a cloud of points and centres, or residuals."""
         tracks, scene = self.job.tracks, self.result.reconstruction
         match path.suffix.lower():
             case ".ply":
@@ -194,8 +219,10 @@ class _SceneAnswer:
             case ".npz":
                 more = arrays_of_result(self.result) | self.more()
                 write_npz_scene(path, tracks, scene, more)
+            case ".csv":
+                save_residuals(path, self.result, tracks)
             case _:
-                save_scene(path, tracks, scene, rigs=self.job.rigs)
+                save_scene(path, *self.job.written(path, scene), rigs=self.job.rigs)
 
     def draw(self, path: Path) -> None:
         """Draw a picture, or write a page."""
@@ -226,6 +253,13 @@ class _SceneAnswer:
             "flags": escape(", ".join(result.flags)) or "none",
             "seconds": f"{self.seconds:.2f}",
         }
+        if result.n_behind:
+            rows["behind"] = f"{result.n_behind} observations of points behind their camera"
+        if result.weakest:
+            rows["weakest"] = escape(result.weakest)
+        if result.rejected.any():
+            count = int(np.count_nonzero(result.rejected))
+            rows["set aside"] = f"{count} of {len(tracks)} observations, as gross errors"
         if result.loss_scale_px:
             rows["loss_scale_px"] = f"{result.loss_scale_px:.4g}"
         if self.job.notes:

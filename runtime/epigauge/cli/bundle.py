@@ -27,7 +27,16 @@ from epigauge.cli._common import (
     write_json,
 )
 from epigauge.cli._live import watching
-from epigauge.cli._scenes import FixView, Refine, Rigs, SceneJob, refuse_options, save_cloud
+from epigauge.cli._scenes import (
+    FixView,
+    ImageSize,
+    Refine,
+    Rigs,
+    SceneJob,
+    refuse_options,
+    save_cloud,
+)
+from epigauge.cli._tables import save_residuals
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import (
     TrackFile,
@@ -37,7 +46,6 @@ from epigauge.io import (
     save_colmap_model,
     save_result,
 )
-from epigauge.io.output import writing
 from epigauge.io.scene_files import is_scene
 from epigauge.io.tracks import arrays_of
 from epigauge.multi_view.display import Display, display
@@ -126,6 +134,7 @@ def bundle(
     refine: Refine = None,
     fix_view: FixView = None,
     rigs: Rigs = "keep",
+    image_size: ImageSize = None,
     json: Json = False,
 ) -> int:
     """Adjust the cameras and points of a file of tracks, or of a scene.
@@ -137,9 +146,10 @@ def bundle(
     --plot and -o may be given several times.
 
     A scene is a COLMAP folder, an NPZ file of `eg.save_scene` or, with
-    --refine, a BAL file: it has calibrated cameras and points to begin with,
-    which stay of their model. -o then takes a folder (COLMAP), .txt or .txt.bz2 (BAL)
-    too; stdout has R | t row by row and the parameters of each view.
+    --refine or --image-size, a BAL file: it has calibrated cameras and points
+    to begin with, which stay of their model. -o then takes a folder (COLMAP; of
+    a BAL file with --image-size), .txt or .txt.bz2 (BAL) too; stdout has R | t
+    row by row and the parameters of each view.
 
     Else pictures, PLY and COLMAP models use a basis in which the scene looks
     plausible: that is no calibration, and nothing can be measured in it.
@@ -148,12 +158,12 @@ def bundle(
     reported and saved as asked, with exit code 130.
     """
     plots, outputs = plot or [], output or []
-    if refine is not None or is_scene(tracks):
+    if refine is not None or image_size is not None or is_scene(tracks):
         others = {"gauge": gauge, "start": start, "colmap": colmap, "clean": clean or None}
         asked = {"method": method, "damping": damping, "loss": loss, "max_iter": max_iter}
         asked |= {"backend": backend, "gauge_mode": gauge_mode, "robust": robust}
         refuse_options(others)
-        scene = SceneJob(tracks, refine, fix_view or [], rigs, y_up)
+        scene = SceneJob(tracks, refine, fix_view or [], rigs, y_up, image_size)
         return scene.run(asked, plots, outputs, json)
     for path in plots:
         check_target(path, ".png", ".svg", ".html")
@@ -281,27 +291,11 @@ class _Answer:
             save_result(path, self.result, **arrays_of(self.file.tracks), **self.more())
             return
         if path.suffix.lower() == ".csv":
-            self.save_table(path)
+            save_residuals(path, self.result, self.file.tracks, self.file.views, self.file.points)
             return
         frame = self.frame
         note = "points blue, cameras orange; a basis to look at, not a calibration"
         save_cloud(path, frame.points[frame.shown], frame.centres, note)
-
-    def save_table(self, path: Path) -> None:
-        """Write each observation, its residual and whether it was set aside, as CSV."""
-        result, file = self.result, self.file
-        names = file.tracks.names or tuple(map(str, file.views.tolist()))
-        columns = (
-            [names[k] for k in file.tracks.view.tolist()],
-            file.points[file.tracks.point].tolist(),
-            *file.tracks.xy.T.tolist(),
-            *result.fun.T.tolist(),
-            result.rejected.astype(int).tolist(),
-        )
-        with writing(path) as stream:
-            stream.write(b"view,point,x,y,residual_x,residual_y,rejected\n")
-            for row in zip(*columns, strict=True):
-                stream.write((",".join(map(str, row)) + "\n").encode())
 
     def draw(self, path: Path) -> None:
         """Draw a picture, or write a page."""

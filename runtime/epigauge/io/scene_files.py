@@ -166,12 +166,16 @@ def scene_content(
         was = f"has {reconstruction.n_views} views and {reconstruction.n_points} points"
         needed = f"{tracks.n_views} and {tracks.n_points}, as the tracks"
         raise ArgumentError("reconstruction", was, needed)
-    suffix = "" if path.is_dir() else path.suffix.lower()
-    if suffix == ".npz":
+    if not is_scene_file(path):
+        return model_of(tracks, reconstruction, rigs)
+    if path.suffix.lower() == ".npz":
         return None
-    if suffix in _BAL:
-        return _nine_numbers(tracks, reconstruction)
-    return model_of(tracks, reconstruction, rigs)
+    return _nine_numbers(tracks, reconstruction)
+
+
+def is_scene_file(path: Path) -> bool:
+    """Tell whether a scene is written to a path as one file, BAL or NPZ, not as COLMAP's folder."""
+    return not path.is_dir() and path.suffix.lower() in (".npz", *_BAL)
 
 
 def is_scene(path: Path) -> bool:

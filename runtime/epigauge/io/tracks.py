@@ -311,7 +311,13 @@ def _form(path: PathLike) -> str:
 
 def _read(path: Path, with_start: bool) -> dict[str, Any]:
     """Read whatever a file holds."""
-    form = _form(path)
+    try:
+        form = _form(path)
+    except ArgumentError as error:
+        if path.exists():
+            raise
+        was = f"is {str(path)!r}, which does not exist"
+        raise ArgumentError("path", was, f"{error.needed}; or a COLMAP folder") from None
     with path.open("rb") as file:
         if form == ".npz":
             start = ("P", "Q", "X") if with_start else ()
