@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from epigauge.multi_view.parallax import fit_homographies
 from epigauge.multi_view.seen import Seen
-from epigauge.multi_view.verdicts import behind, missing_by_count
+from epigauge.multi_view.verdicts.counting import missing_by_count
+from epigauge.multi_view.verdicts.front import behind
 from epigauge.verdicts import FLAGS, usable
 from numpy.typing import NDArray
 

@@ -29,7 +29,9 @@ from epigauge.multi_view.prior_noise import with_estimated_noise
 from epigauge.multi_view.rejection import without_gross_errors
 from epigauge.multi_view.repeated import merging_sightings
 from epigauge.multi_view.tracks import Tracks
-from epigauge.multi_view.verdicts import Verdict, judged, judged_metric
+from epigauge.multi_view.verdicts.metric import judged_metric
+from epigauge.multi_view.verdicts.projective import judged
+from epigauge.multi_view.verdicts.verdict import Verdict
 from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
 from epigauge.verdicts import FLAGS, usable
 

@@ -1,0 +1,165 @@
+"""What of projective cameras and points the normal matrix leaves open."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.bundle.dampings import Covariant
+from epigauge.bundle.null_space import generators
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.problem import BundleState, Estimate
+from epigauge.bundle.reduced import Bordered, Iterated, reduced_system
+from epigauge.bundle.run import bundle_problem
+from epigauge.bundle.solve import BundleSystem
+from epigauge.cameras import camera_model
+from epigauge.kernels import Table
+from epigauge.multi_view.frame import Frame
+from epigauge.multi_view.gauge import normalized
+from epigauge.multi_view.seen import Seen
+from epigauge.multi_view.verdicts.counting import CAMERA
+
+__all__ = ["open_directions", "suits"]
+
+Array = NDArray[np.float64]
+
+#: An eigenvalue of N below this, where W of the covariant damping is one, is rounding.
+_ROUNDING = 1e-11
+
+#: Up to so many cameras all eigenvalues are computed; of more, the smallest, by iterations.
+_FEW, _COLUMNS, _ITERATIONS = 12, 4, 3
+
+#: Shift with which a singular matrix is factored; larger where conjugate gradients solve.
+_SHIFT, _SHIFT_ITERATIVE = 1e-12, 1e-5
+
+#: Least over largest spread of points in a basis that suits computing.
+_SPREAD = 0.01
+
+
+def suits(system: BundleSystem) -> bool:
+    """Tell whether normal equations are those of all parameters, in a basis fit to compute in."""
+    ties = system.ties
+    if ties.n_shared or ties.A is not None or ties.C is not None or system.constraints is not None:
+        return False
+    Q = system.points / np.linalg.norm(system.points, axis=1, keepdims=True)
+    values = np.linalg.eigvalsh(Q.T @ Q)
+    return bool(values[0] > _SPREAD * values[-1])
+
+
+def open_directions(
+    seen: Seen, frame: Frame, kernels: Table, workers: int, system: BundleSystem | None
+) -> tuple[int, int, float]:
+    """Return how many directions beside the gauge N leaves open, and its least other eigenvalue.
+
+    Those of the cameras, and those of single points, which spoil nothing else.
+
+    In parameters in which W of the covariant damping is one, for which the basis does not matter.
+    """
+    try:
+        # Where a camera or a point is all but undefined, numbers overflow: it is open.
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            system = system or _normal_equations(seen, frame, kernels, workers)
+            found = _measured(system, kernels)
+    except np.linalg.LinAlgError:
+        return 1, 0, 0.0
+    return found if np.isfinite(found[2]) else (1, 0, 0.0)
+
+
+def _normal_equations(seen: Seen, frame: Frame, kernels: Table, workers: int) -> BundleSystem:
+    """Return the normal equations of what counts, in the best conditioned basis."""
+    graph = ObservationGraph(seen.view, seen.point, seen.n, seen.m)
+    own = Frame(frame.origins[seen.views], frame.scale)
+    parts = camera_model("projective"), kernels, graph, own.points_in(seen.xy, seen.view)
+    P = own.cameras_in(seen.P)
+    P, Q = normalized().transformation(P, seen.Q).apply(P, seen.Q)
+    problem = bundle_problem(*parts, seen.weights, workers=workers)
+    return problem.linearize(BundleState(Estimate(P.reshape(-1, 12), Q), 0.0))
+
+
+def _measured(system: BundleSystem, kernels: Table) -> tuple[int, int, float]:
+    W = Covariant().blocks(system)
+    # A point whose lines of sight are one leaves W singular, too.
+    lifted = [
+        blocks + 1e-12 * _mean_diagonal(blocks) * np.eye(blocks.shape[1])
+        for blocks in (W.cameras, W.points)
+    ]
+    roots = [np.swapaxes(np.linalg.cholesky(blocks), 1, 2) for blocks in lifted]
+    whitening = [np.asarray(np.linalg.inv(root)) for root in roots]
+    p, q, moves = _freedom(system, kernels, roots)
+    n, a = p.shape
+    white = system.tied(*whitening)
+    U = white.U + p[:, :, None] * p[:, None, :]
+    open_points, V = _grounded(white.V + q[:, :, None] * q[:, None, :])
+    T = whitening[1] @ np.asarray(np.swapaxes(np.linalg.inv(np.linalg.cholesky(V)), 1, 2))
+    coupling = system.normal.coupling
+    if n <= _FEW:
+        less = coupling.schur(T, None)[0].dense().transpose(0, 2, 1, 3)
+        S = -(np.swapaxes(whitening[0], 1, 2)[:, None] @ less @ whitening[0])
+        S[np.arange(n), np.arange(n)] += U
+        dense = S.transpose(0, 2, 1, 3).reshape(n * a, n * a)
+        values = np.linalg.eigvalsh(dense + moves @ moves.T)
+    else:
+        shift = _SHIFT if coupling.direct else _SHIFT_ITERATIVE
+        shifted, _ = reduced_system(
+            system.normal, white.ties, T, None, U + shift * np.eye(a), shift
+        )
+        columns = _COLUMNS if coupling.direct else 2
+        while True:
+            values = _least(shifted, shift, moves, columns)
+            if columns >= n * a // 2 or not coupling.direct or values[-1] > _ROUNDING:
+                break
+            columns *= 4
+    open_cameras = int(np.count_nonzero(values <= _ROUNDING))
+    return open_cameras, open_points, float(max(values[0], 0.0))
+
+
+def _freedom(
+    system: BundleSystem, kernels: Table, roots: list[Array]
+) -> tuple[Array, Array, Array]:
+    """Return unit directions of the scales, and the changes of basis as S knows them, (12 n, 15).
+
+    What N does not see, S does not see in the cameras alone.
+    """
+    p = np.einsum("nij,nj->ni", roots[0], system.cameras)
+    q = np.einsum("nij,nj->ni", roots[1], system.points)
+    p, q = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (p, q))
+    estimate = system.model, kernels, system.cameras, system.points
+    cameras = roots[0] @ generators(*estimate)[0]
+    cameras = cameras - p[:, :, None] * np.einsum("ni,nik->nk", p, cameras)[:, None]
+    moves = np.linalg.qr(cameras.reshape(p.size, -1))[0]
+    return p, q, np.asarray(moves)
+
+
+def _least(shifted: Bordered | Iterated, shift: float, moves: Array, columns: int) -> Array:
+    """Return the least eigenvalues of S beside the gauge, from above: inverse iterations."""
+    size = len(moves)
+    X = np.random.default_rng(0).standard_normal((size, columns))
+    for _ in range(_ITERATIONS):
+        X = np.linalg.qr(X - moves @ (moves.T @ X))[0]
+        Y = shifted.solve(X.reshape(-1, CAMERA + 1, columns), np.zeros((0, columns)))[0]
+        Y = Y.reshape(size, columns)
+        Y -= moves @ (moves.T @ Y)
+        # X^T S^-1 X has the inverse eigenvalues: Ritz values without a product with S.
+        inverse = np.linalg.eigvalsh(0.5 * (X.T @ Y + Y.T @ X))[::-1]
+        X = Y
+    return np.asarray(1.0 / np.maximum(inverse, 1e-300) - shift)
+
+
+def _grounded(V: Array) -> tuple[int, Array]:
+    """Return how many directions of single points are open, and the blocks with these closed."""
+    try:
+        diagonal = np.einsum("nii->ni", np.linalg.cholesky(V + 1e-14 * np.eye(4)))
+        thin = np.flatnonzero(diagonal.min(axis=1) ** 2 <= 1e3 * _ROUNDING)
+    except np.linalg.LinAlgError:  # some block is singular to rounding: all are looked at
+        thin = np.arange(len(V))
+    if not len(thin):
+        return 0, V
+    values, vectors = np.linalg.eigh(V[thin])
+    open_ = values <= _ROUNDING
+    V = V.copy()
+    V[thin] = (vectors * np.where(open_, 1.0, values)[:, None]) @ np.swapaxes(vectors, 1, 2)
+    return int(np.count_nonzero(open_)), V
+
+
+def _mean_diagonal(blocks: Array) -> Array:
+    return np.asarray(np.einsum("nii->n", blocks) / blocks.shape[1])[:, None, None]
