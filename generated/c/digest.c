@@ -7,7 +7,7 @@
 
 const char *eg_digest(void)
 {
-    return "dc1deb73105cf10d";
+    return "52b42df11d37798f";
 }
 
 const char *eg_sources(void)

@@ -1369,6 +1369,28 @@ EG_EXPORT void eg_rotation_derivatives(
     double *EG_RESTRICT dU,
     double *EG_RESTRICT d2U);
 
+EG_EXPORT void eg_dual_image_rows(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P,
+    double *EG_RESTRICT rows);
+
+EG_EXPORT void eg_camera_intrinsics(
+    ptrdiff_t n,
+    const double *EG_RESTRICT P,
+    double *EG_RESTRICT values,
+    double *EG_RESTRICT J);
+
+EG_EXPORT void eg_two_view_focals(
+    ptrdiff_t n,
+    const double *EG_RESTRICT F,
+    const double *EG_RESTRICT c1,
+    const double *EG_RESTRICT c2,
+    const double *EG_RESTRICT e1,
+    const double *EG_RESTRICT e2,
+    double *EG_RESTRICT squares,
+    double *EG_RESTRICT J_F,
+    double *EG_RESTRICT J_c);
+
 /* A camera model: sizes of camera, update and point, and its kernels. */
 typedef struct {
     const char *name;

@@ -1091,6 +1091,24 @@ SIGNATURES = {
         (Argument("dU", (3, 3, 3), True), Argument("d2U", (3, 3, 3, 3), True), ),
         "first and second derivatives of U R(theta) at theta = 0 (from B&S eqs. 1, 3).",
     ),
+    "dual_image_rows": Signature(
+        "self_calibration",
+        (Argument("P", (3, 4), True), ),
+        (Argument("rows", (6, 10), True), ),
+        "coefficients of P Omega P^T (upper triangle) by the upper triangle of the dual absolute quadric Omega.",
+    ),
+    "camera_intrinsics": Signature(
+        "self_calibration",
+        (Argument("P", (3, 4), True), ),
+        (Argument("values", (5,), True), Argument("J", (5, 8), True), ),
+        "(log f, log fx / fy, skew, cx, cy) of a camera P = (A | a) in a metric basis, A A^T ~ K K^T, and their Jacobian by the update P (U, 0; p^T, 1) of the basis: five numbers of U, three of the plane at infinity.",
+    ),
+    "two_view_focals": Signature(
+        "self_calibration",
+        (Argument("F", (3, 3), True), Argument("c1", (2,), True), Argument("c2", (2,), True), Argument("e1", (3,), True), Argument("e2", (3,), True), ),
+        (Argument("squares", (2,), True), Argument("J_F", (2, 9), True), Argument("J_c", (2, 4), True), ),
+        "squared focal lengths of two cameras from F and their principal points (Bougnoux, 1998), with Jacobians by vect(F) and by both points; e1, e2: the epipoles in coordinates about the principal points, as directions only.",
+    ),
 }
 
 MODELS = {

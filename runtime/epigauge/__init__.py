@@ -35,6 +35,8 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
         save_tracks,
     )
     from epigauge.kernels import backend, set_backend
+    from epigauge.metric.pair import FocalLengths, focal_lengths
+    from epigauge.metric.upgrade import MetricUpgrade, metric_upgrade
     from epigauge.multi_view import gauge
     from epigauge.multi_view.adjust import BundleResult, bundle_adjust
     from epigauge.multi_view.affine_start import initialize_affine
@@ -69,6 +71,7 @@ __all__ = [
     "Distance",
     "EpigaugeError",
     "FileFormatError",
+    "FocalLengths",
     "FundamentalBatch",
     "FundamentalResult",
     "ImageMatches",
@@ -76,6 +79,7 @@ __all__ = [
     "Matches",
     "MetricCovariance",
     "MetricReconstruction",
+    "MetricUpgrade",
     "MultiViewScene",
     "PointPrior",
     "PositionPrior",
@@ -94,6 +98,7 @@ __all__ = [
     "covariance",
     "datasets",
     "estimate_fundamental",
+    "focal_lengths",
     "fundamental_7point",
     "fundamental_8point",
     "gauge",
@@ -108,6 +113,7 @@ __all__ = [
     "load_scene",
     "load_tracks",
     "match_images",
+    "metric_upgrade",
     "multi_view_scene",
     "refine_fundamental",
     "refine_fundamental_batch",
@@ -135,6 +141,8 @@ _WHERE = {
         "save_matches save_reconstruction save_result save_scene save_tracks"
     ),
     "kernels": "backend set_backend",
+    "metric.pair": "FocalLengths focal_lengths",
+    "metric.upgrade": "MetricUpgrade metric_upgrade",
     "multi_view.adjust": "BundleResult bundle_adjust",
     "multi_view.affine_start": "initialize_affine",
     "multi_view.compare": "Comparison compare",

@@ -73,6 +73,31 @@ FLAGS = {
         "take images from different places",
         ("F", "E", "views"),
     ),
+    "pure translation": Flag(
+        "the camera moved without turning: every focal length explains the tracks",
+        "take images from other directions as well, or give the focal length",
+        ("views",),
+    ),
+    "one rotation axis": Flag(
+        "all views are turned about one axis: the intrinsics follow from square pixels and a "
+        "shared camera alone, and not at all if the axis is the line of sight",
+        "trust the standard deviations, or tilt the camera in some images",
+    ),
+    "one viewing point": Flag(
+        "all views look at one point, which stays in its place in the image: the intrinsics are "
+        "determined less well than by any other motion",
+        "trust the standard deviations, or look past the point in some images",
+    ),
+    "weak focal length": Flag(
+        "the standard deviation of a focal length exceeds a twentieth of it",
+        "add views that are turned against the others, or give the focal length",
+    ),
+    "unlike cameras": Flag(
+        "cameras with square pixels and the intrinsics they are said to share do not explain the "
+        "tracks nearly as well as projective cameras do",
+        "look for wrong matches, give each view its own camera (shared=False), or another model",
+        ("views",),
+    ),
     "undetermined": Flag(
         "some parameters can change without changing any residual",
         "add matches or views that fix them, or hold them fixed",

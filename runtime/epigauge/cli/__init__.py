@@ -19,6 +19,7 @@ from epigauge.cli.data import data
 from epigauge.cli.demo import demo
 from epigauge.cli.estimate import estimate
 from epigauge.cli.info import info
+from epigauge.cli.metric import metric
 from epigauge.cli.pair import pair
 from epigauge.cli.refine import refine
 from epigauge.cli.reproduce import reproduce
@@ -53,5 +54,17 @@ def _main(
     """
 
 
-for _function in (demo, refine, estimate, pair, bundle, compare, colmap, data, info, reproduce):
+for _function in (
+    demo,
+    refine,
+    estimate,
+    pair,
+    bundle,
+    metric,
+    compare,
+    colmap,
+    data,
+    info,
+    reproduce,
+):
     app.command()(command(_function))

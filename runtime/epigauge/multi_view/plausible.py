@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge.linear import Dense, Seber
 
-__all__ = ["camera_deviations", "depth_signs", "plausible_basis"]
+__all__ = ["basis_of_pair", "camera_basis", "camera_deviations", "depth_signs", "plausible_basis"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -84,12 +84,12 @@ def plausible_basis(P: Array, Q: Array, view: Indices, point: Indices) -> Array:
     a, b = np.nonzero(~np.eye(len(P), dtype=np.bool_))
     some = np.linspace(0, len(a) - 1, min(len(a), _PAIRS)).astype(int)
     for i, k in zip(a[some].tolist(), b[some].tolist(), strict=True):
-        problem = _Plausibility(P, few, _camera_basis(P[i]), penalty)
+        problem = _Plausibility(P, few, camera_basis(P[i]), penalty)
         # A camera and its negative are the same, but of the planes at infinity that they lead to
         # one has the points in front of one camera and behind the other.
         for P2 in (P[k] @ problem.first, -P[k] @ problem.first):
             for f in _FOCAL:
-                attempt(problem, problem.first @ _basis_of_pair(P2, f))
+                attempt(problem, problem.first @ basis_of_pair(P2, f))
     tried.sort()
     if tried[0][0] == float("inf"):
         raise np.linalg.LinAlgError("no basis")
@@ -216,8 +216,21 @@ def _refined(problem: _Plausibility, T: Array, ftol: float) -> Array:
     return lm.minimize(problem, T, Seber(), lm.Classic(), stopping).state.T
 
 
-def _basis_of_pair(P2: Array, f: float) -> Array:
-    """Return the basis that two focal lengths f imply for (I | 0) and P2 (GF10, section 3.1)."""
+def basis_of_pair(P2: Array, f: float) -> Array:
+    """Return the basis that two focal lengths imply for (I | 0) and another camera [GF10]_.
+
+    Parameters
+    ----------
+    P2 : ndarray, shape (3, 4)
+        Second camera.
+    f : float
+        Both focal lengths, principal points in the origin.
+
+    Returns
+    -------
+    ndarray, shape (4, 4)
+        T, in which both cameras have them: section 3.1.
+    """
     K, K_inverse = np.diag([f, f, 1.0]), np.diag([1.0 / f, 1.0 / f, 1.0])
     t = K_inverse @ P2[:, 3]
     length = np.linalg.norm(t)
@@ -268,6 +281,17 @@ def _in_basis(T: Array, Q: Array) -> Array:
     return np.asarray(Q @ np.linalg.inv(T).T)
 
 
-def _camera_basis(P: Array) -> Array:
-    """Return T with P T = (I | 0): pseudo-inverse, then camera centre."""
+def camera_basis(P: Array) -> Array:
+    """Return T with P T = (I | 0): pseudo-inverse, then camera centre.
+
+    Parameters
+    ----------
+    P : ndarray, shape (3, 4)
+        Camera.
+
+    Returns
+    -------
+    ndarray, shape (4, 4)
+        T.
+    """
     return np.column_stack([np.linalg.pinv(P), np.linalg.svd(P)[2][3]])

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from epigauge.cameras import MetricReconstruction
 from epigauge.io import plain
 from epigauge.io._common import PathLike, check_suffix
 from epigauge.multi_view.adjust import BundleResult
@@ -37,10 +38,10 @@ def save_viewer(
 ) -> None:
     """Write points and cameras as a page to look at them from all sides.
 
-    They are shown in a basis in which they look plausible (see `multi_view.display`): that is no
-    calibration, and nothing can be measured in it. Points are coloured by their RMS residual, by
-    the number of views or by height, cameras are pyramids, and whatever is under the pointer tells
-    its numbers. The page needs no network and no other file.
+    Projective ones are shown in a basis in which they look plausible (see `multi_view.display`):
+    that is no calibration, and nothing can be measured in it. Points are coloured by their RMS
+    residual, by the number of views or by height, cameras are pyramids, and whatever is under the
+    pointer tells its numbers. The page needs no network and no other file.
 
     Parameters
     ----------
@@ -74,7 +75,10 @@ def save_viewer(
     )
     if result.loss_scale_px:
         lead += f" (robust loss of scale {result.loss_scale_px:.2g} px)"
-    lead += ". A basis to look at, no calibration: nothing can be measured in it."
+    if isinstance(result.reconstruction, MetricReconstruction):
+        lead += ". Calibrated cameras: the shape is true, its size is not known."
+    else:
+        lead += ". A basis to look at, no calibration: nothing can be measured in it."
     hidden = tracks.n_points - int(shown.shown.sum())
     if hidden:
         lead += f" {hidden} points far away or behind a camera are not shown."

@@ -1,0 +1,137 @@
+"""Focal lengths from one fundamental matrix."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge import kernels
+from epigauge._arguments import as_positive, as_real
+from epigauge.errors import ArgumentError
+
+__all__ = ["FocalLengths", "focal_lengths"]
+
+Array = NDArray[np.float64]
+
+#: Relative standard deviations beyond which a focal length is weak, or open.
+WEAK, OPEN = 0.05, 0.3
+
+
+class FocalLengths(NamedTuple):
+    """Focal lengths of two views.
+
+    Attributes
+    ----------
+    focal_px : tuple of float
+        Of the first and the second view; NaN where F has none.
+    std_px : tuple of float
+        Their standard deviations, to first order.
+    flag : str
+        Empty; "weak focal length" beyond 5 %; or "undetermined" beyond 30 %, or where F has no real
+        focal lengths: the optical axes meet or are parallel, or nearly so.
+    """
+
+    focal_px: tuple[float, float]
+    std_px: tuple[float, float]
+    flag: str
+
+
+def focal_lengths(
+    F: ArrayLike,
+    centre1: ArrayLike,
+    centre2: ArrayLike,
+    *,
+    covariance: ArrayLike | None = None,
+    centre_std_px: float = 10.0,
+    backend: str | None = None,
+) -> FocalLengths:
+    """Return the focal lengths of two views with square pixels from their fundamental matrix.
+
+    f1^2 = -(p2^T [e2]x D F p1) (p1^T F^T p2) / (p2^T [e2]x D F D F^T p2) with D = diag(1, 1, 0),
+    principal points p1, p2 and the epipole e2 [1]_, and likewise for the second view.
+
+    Parameters
+    ----------
+    F : array_like, shape (3, 3)
+        Fundamental matrix, ``x2^T F x1 = 0`` in pixels.
+    centre1, centre2 : array_like, shape (2,)
+        Principal points in pixels, as a rule the centres of the images.
+    covariance : array_like, shape (9, 9), optional
+        Covariance of F row by row, such as `FundamentalResult.covariance`, for the same scale of F.
+        By default F counts as exact.
+    centre_std_px : float
+        Standard deviation of each coordinate of the principal points. The centre of an image is
+        rarely the principal point to better than about ten pixels.
+    backend : {"c", "numpy", "casadi"}, optional
+        Where the formula is computed.
+
+    Returns
+    -------
+    FocalLengths
+        ``focal_px``, ``std_px``, ``flag``.
+
+    Raises
+    ------
+    ArgumentError
+        On other shapes, and numbers that are not finite.
+
+    Notes
+    -----
+    Nothing is determined where both optical axes lie in one plane, as of two cameras side by side
+    or turned towards one point: the most frequent arrangements of two views. More views do better:
+    see `metric_upgrade`.
+
+    References
+    ----------
+    .. [1] S. Bougnoux, "From projective to Euclidean space under any practical situation, a
+       criticism of self-calibration", ICCV 1998.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> K1, K2 = np.diag([800.0, 800.0, 1.0]), np.diag([900.0, 900.0, 1.0])
+    >>> R = np.array([[0.8, 0.0, -0.6], [0.36, 0.8, 0.48], [0.48, -0.6, 0.64]])
+    >>> E = np.cross(np.eye(3), [1.0, 0.5, 0.2]).T @ R
+    >>> F = np.linalg.inv(K2) @ E @ np.linalg.inv(K1)
+    >>> found = eg.focal_lengths(F, (0, 0), (0, 0), centre_std_px=1.0)
+    >>> np.round(found.focal_px, 6).tolist(), found.flag
+    ([800.0, 900.0], '')
+    """
+    matrix = _checked("F", F, (3, 3))
+    c = np.concatenate([_checked("centre1", centre1, (2,)), _checked("centre2", centre2, (2,))])
+    if not np.any(matrix):
+        raise ArgumentError("F", "is zero", "a fundamental matrix")
+    C = np.zeros((9, 9)) if covariance is None else _checked("covariance", covariance, (9, 9))
+    centre_std = as_positive("centre_std_px", centre_std_px, zero=True)
+    # In units of which focal lengths are about one, and F of norm one.
+    unit = max(float(np.abs(c).mean()), 100.0) * 3.0
+    D = np.diag([unit, unit, 1.0])
+    scaled = D @ matrix @ D
+    size = float(np.linalg.norm(scaled))
+    scaled, c = scaled / size, c / unit
+    shifts = np.array([[[1, 0, x], [0, 1, y], [0, 0, 1]] for x, y in c.reshape(2, 2)])
+    U, _, Vt = np.linalg.svd(shifts[1].T @ scaled @ shifts[0])
+    with np.errstate(all="ignore"):
+        table = kernels.table(backend)
+        squares, J_F, J_c = table.two_view_focals(scaled, c[:2], c[2:], Vt[2], U[:, 2])
+        rows = J_F * np.outer(np.diag(D), np.diag(D)).ravel() / size
+        variances = np.einsum("ki,ij,kj->k", rows, C, rows)
+        variances += (centre_std / unit) ** 2 * np.sum(J_c**2, axis=1)
+        focal = np.sqrt(np.where(squares > 0.0, squares, np.nan))
+        std = np.sqrt(np.maximum(variances, 0.0)) / (2.0 * focal)
+        share = np.nan_to_num(std / focal, nan=np.inf).max()
+    flag = "undetermined" if share > OPEN else "weak focal length" if share > WEAK else ""
+    first, second = (unit * focal).tolist()
+    of_first, of_second = np.nan_to_num(unit * std, nan=np.inf).tolist()
+    return FocalLengths((first, second), (of_first, of_second), flag)
+
+
+def _checked(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    array = as_real(name, value, f"an array of shape {shape}")
+    if array.shape != shape:
+        raise ArgumentError(name, f"has shape {array.shape}", f"{shape}")
+    if not np.isfinite(array).all():
+        raise ArgumentError(name, "is not finite", "finite numbers")
+    return np.asarray(array, dtype=np.float64)

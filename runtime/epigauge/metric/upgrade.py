@@ -1,0 +1,347 @@
+"""From tracks to calibrated cameras: projective, then a metric basis, then metric adjustment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge import kernels
+from epigauge._arguments import as_array, as_count, as_real
+from epigauge.cameras import MetricReconstruction, camera_model
+from epigauge.errors import ArgumentError
+from epigauge.metric.motion import motion_flags
+from epigauge.metric.pair import OPEN, WEAK
+from epigauge.metric.samples import sampled
+from epigauge.metric.scene import Images, with_all_points
+from epigauge.metric.search import MODELS, Candidate, Fit, Search
+from epigauge.multi_view.adjust import BundleResult, bundle_adjust
+from epigauge.multi_view.tracks import MIN_VIEWS, Reconstruction, Tracks
+from epigauge.multi_view.uncertainty import covariance
+from epigauge.uncertainty.covariance import MetricCovariance
+from epigauge.verdicts import FLAGS, ordered, usable
+
+__all__ = ["MetricUpgrade", "metric_upgrade"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class MetricUpgrade:
+    """A metric scene from tracks alone, and what is known of its cameras.
+
+    Attributes
+    ----------
+    reconstruction : MetricReconstruction or None
+        Cameras and points after metric adjustment; None where nothing was found, then `flags` say
+        why.
+    focal_px, focal_std_px : float or ndarray, shape (c,)
+        Focal length in pixels and its standard deviation, to first order, of one camera, or of each
+        of several (the mean of fx and fy of models that have both). The deviation is infinite where
+        nothing determines it.
+    flags : tuple of str
+        From `epigauge.verdicts.FLAGS`.
+    success : bool
+        Whether the scene may be used: adjusted, and determined.
+    message : str
+        How it ended.
+    rms_px : float
+        Of the observations that were not set aside, per coordinate.
+    noise_px : float
+        Standard deviation of an image coordinate, estimated.
+    rejected : ndarray of bool, shape (N,)
+        Observations that were set aside as gross errors.
+    refined : tuple of str
+        Intrinsics that the tracks determine, and that were refined; the others are where they
+        began: principal points in the centre, no distortion.
+    candidates : tuple of Candidate
+        Metric bases that were tried, the one taken first.
+    bundle : BundleResult or None
+        The last adjustment.
+    covariance : MetricCovariance or None
+        Of everything.
+    """
+
+    reconstruction: MetricReconstruction | None = field(repr=False)
+    focal_px: float | Array
+    focal_std_px: float | Array
+    flags: tuple[str, ...]
+    success: bool
+    message: str
+    rms_px: float
+    noise_px: float
+    rejected: NDArray[np.bool_] = field(repr=False)
+    refined: tuple[str, ...]
+    candidates: tuple[Candidate, ...] = field(repr=False)
+    bundle: BundleResult | None = field(repr=False)
+    covariance: MetricCovariance | None = field(repr=False)
+
+    def kept(self, tracks: Tracks) -> tuple[Tracks, MetricReconstruction]:
+        """Return the observations that were not set aside, and the scene of what they show.
+
+        Parameters
+        ----------
+        tracks : Tracks
+            Those that `metric_upgrade` was given.
+
+        Returns
+        -------
+        tracks : Tracks
+            Points with two good observations or more, renumbered; all views.
+        reconstruction : MetricReconstruction
+            Cameras, and these points.
+
+        Raises
+        ------
+        ArgumentError
+            Where there is no scene, or nothing is left of some view.
+        """
+        if self.reconstruction is None:
+            raise ArgumentError("result", "has no scene", "tracks that determine one")
+        good = ~self.rejected & (tracks.weights > 0.0)
+        lengths = np.bincount(tracks.point[good], minlength=tracks.n_points)
+        points = np.flatnonzero(lengths >= MIN_VIEWS)
+        good &= lengths[tracks.point] >= MIN_VIEWS
+        number = np.cumsum(lengths >= MIN_VIEWS) - 1
+        part = Tracks(
+            tracks.view[good],
+            number[tracks.point[good]],
+            tracks.xy[good],
+            tracks.n_views,
+            len(points),
+            tracks.weights[good],
+            names=tracks.names,
+            sizes=tracks.sizes,
+            colours=None if tracks.colours is None else tracks.colours[points],
+            min_points=1,
+            repeated=True,
+        )
+        scene = self.reconstruction
+        return part, MetricReconstruction(scene.R, scene.t, scene.X[points], scene.cameras)
+
+
+def metric_upgrade(
+    tracks: Tracks,
+    reconstruction: Reconstruction | None = None,
+    *,
+    image_size: ArrayLike,
+    shared: bool | ArrayLike = True,
+    camera: str = "SIMPLE_RADIAL",
+    workers: int = 1,
+    backend: str | None = None,
+) -> MetricUpgrade:
+    """Reconstruct calibrated cameras and points from tracks, knowing nothing of the cameras.
+
+    A projective reconstruction of some of the tracks is brought into the basis in which its cameras
+    have square pixels and principal points near the centres [1]_; then all of them are adjusted,
+    with the intrinsics free, and gross errors set aside.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Observations, gross errors included.
+    reconstruction : Reconstruction, optional
+        Projective cameras and points of all tracks to begin with; by default found from the tracks.
+    image_size : array_like, shape (2,) or (n, 2)
+        Width and height in pixels of all images, or of each.
+    shared : bool or array_like of int, shape (n,)
+        True: one camera took all views. False: each view has a camera of its own. Numbers: the
+        camera of each view, from 0; its views have one size.
+    camera : str
+        Model of the cameras: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or FULLOPENCV.
+    workers : int
+        Threads, as of `bundle_adjust`.
+    backend : {"c", "numpy", "casadi"}, optional
+        Where the formulas are computed.
+
+    Returns
+    -------
+    MetricUpgrade
+        Scene, focal lengths with their standard deviations, and flags. Where the views do not
+        determine it (a camera that only turned, or only moved without turning), `success` is False.
+
+    Raises
+    ------
+    ArgumentError
+        If sizes or cameras do not fit the tracks.
+
+    Notes
+    -----
+    Principal points and distortion are refined as far as the tracks determine them. Of two views
+    only the focal length is.
+
+    The motion is named where it is one that self-calibration has trouble with: "pure translation",
+    "pure rotation", "one rotation axis", "one viewing point". With square pixels the latter two
+    often determine everything; the standard deviations tell.
+
+    References
+    ----------
+    .. [1] M. Pollefeys, R. Koch, L. Van Gool, "Self-calibration and metric reconstruction in spite
+       of varying and unknown intrinsic camera parameters", IJCV 32(1), 1999.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.multi_view_scene(n_views=6, noise_px=0.3, focal=900.0, seed=1)
+    >>> found = eg.metric_upgrade(scene.tracks, image_size=(800, 600))  # doctest: +SKIP
+    """
+    images = _images(tracks, image_size, shared)
+    if camera not in MODELS:
+        raise ArgumentError("camera", f"is {camera!r:.60}", f"one of {', '.join(MODELS)}")
+    workers = as_count("workers", workers)
+    if reconstruction is not None:
+        size = len(reconstruction.P), len(reconstruction.Q)
+        if size != (tracks.n_views, tracks.n_points):
+            was = f"is of {size[0]} views and {size[1]} points"
+            needed = f"{tracks.n_views} and {tracks.n_points}, as the tracks"
+            raise ArgumentError("reconstruction", was, needed)
+    search = Search(sampled(tracks), images, camera, workers, backend)
+    fit = search.run(reconstruction)
+    if fit is None:
+        return _nothing(tracks, images, search.flags)
+    start = fit.reconstruction
+    if not search.sample.whole:
+        start = with_all_points(start, tracks, images, kernels.table(backend))
+    options: Any = {"refine": fit.refined, "workers": workers, "backend": backend}
+    try:
+        bundle = bundle_adjust(tracks, start, robust=True, ftol=1e-6, **options)
+    except ArgumentError:  # so degenerate that no step can be made
+        return _nothing(tracks, images, ("undetermined",))
+    return _judged(tracks, images, search, fit, bundle, backend)
+
+
+def _judged(
+    tracks: Tracks,
+    images: Images,
+    search: Search,
+    fit: Fit,
+    bundle: BundleResult,
+    backend: str | None,
+) -> MetricUpgrade:
+    """Return the result of an adjustment, with standard deviations and flags."""
+    found: MetricReconstruction = bundle.reconstruction
+    focal, known = _focal_lengths(found), None
+    weights = np.where(bundle.rejected, 0.0, tracks.weights)
+    flags, turn_std = set(bundle.flags), 0.0
+    std = np.full(len(focal), np.inf)
+    try:
+        known = covariance(tracks.weighted(weights), found, refine=fit.refined, backend=backend)
+        std = _focal_deviations(known)
+    except ArgumentError:
+        flags.add("undetermined")
+    with np.errstate(invalid="ignore"):
+        share = np.nan_to_num(std / focal, nan=np.inf)
+    if (share > WEAK).any():
+        flags.add("weak focal length")
+        turn_std = 0.0 if known is None else _turn_std(known)
+    flags |= set(motion_flags(found, images, turn_std))
+    if (share > OPEN).any():
+        flags.add("undetermined")
+    if search.misfit(fit):
+        flags.add("unlike cameras")
+    listed = ordered(flags)
+    spoiling = [f"{name}: {FLAGS[name].sentence}" for name in listed if not usable([name], "views")]
+    one = len(focal) == 1
+    return MetricUpgrade(
+        reconstruction=found,
+        focal_px=float(focal[0]) if one else focal,
+        focal_std_px=float(std[0]) if one else std,
+        flags=listed,
+        success=bundle.status > 0 and not spoiling,
+        message="; but ".join([bundle.message.split("; but ")[0], *spoiling]),
+        rms_px=_rms_px(bundle, weights),
+        noise_px=float("nan") if known is None else known.noise_px,
+        rejected=bundle.rejected,
+        refined=fit.refined,
+        candidates=fit.candidates,
+        bundle=bundle,
+        covariance=known,
+    )
+
+
+def _rms_px(bundle: BundleResult, weights: Array) -> float:
+    kept = bundle.fun[weights > 0.0]
+    return float(np.sqrt(np.mean(kept**2))) if len(kept) else float("nan")
+
+
+def _nothing(tracks: Tracks, images: Images, flags: tuple[str, ...]) -> MetricUpgrade:
+    """Return that there is no metric scene, and why."""
+    count = int(images.group.max()) + 1
+    nan, inf = np.full(count, np.nan), np.full(count, np.inf)
+    sentences = [f"{name}: {FLAGS[name].sentence}" for name in flags]
+    return MetricUpgrade(
+        reconstruction=None,
+        focal_px=float("nan") if count == 1 else nan,
+        focal_std_px=float("inf") if count == 1 else inf,
+        flags=flags,
+        success=False,
+        message="; ".join(["no metric scene was found", *sentences]),
+        rms_px=float("nan"),
+        noise_px=float("nan"),
+        rejected=np.zeros(len(tracks), dtype=np.bool_),
+        refined=(),
+        candidates=(),
+        bundle=None,
+        covariance=None,
+    )
+
+
+def _focal_lengths(found: MetricReconstruction) -> Array:
+    """Return the focal length of each camera, the mean of both where there are two."""
+    places = list(camera_model(found.cameras.model).focal)
+    return np.asarray(found.cameras.params[:, places].mean(axis=1))
+
+
+def _focal_deviations(known: MetricCovariance) -> Array:
+    """Return the standard deviation of each focal length."""
+    cameras = known.reconstruction.cameras
+    model = camera_model(cameras.model)
+    share = np.zeros(len(model.adjusted))
+    share[list(model.focal)] = 1.0 / len(model.focal)
+    blocks = [known.intrinsics(c) for c in range(len(cameras))]
+    return np.sqrt([max(float(share @ block @ share), 0.0) for block in blocks])
+
+
+def _turn_std(known: MetricCovariance) -> float:
+    """Return the median standard deviation of the rotations, radians."""
+    n = known.reconstruction.n_views
+    variances = [np.trace(known.camera(i)[:3, :3]) for i in range(n)]
+    return float(np.sqrt(np.median(variances)))
+
+
+def _images(tracks: Tracks, image_size: ArrayLike, shared: bool | ArrayLike) -> Images:
+    """Check sizes and cameras."""
+    n = tracks.n_views
+    sizes = as_real("image_size", image_size, "(width, height), or a row a view")
+    if sizes.shape not in ((2,), (n, 2)):
+        raise ArgumentError("image_size", f"has shape {sizes.shape}", f"(2,) or ({n}, 2)")
+    if not (np.isfinite(sizes) & (sizes >= 1.0)).all():
+        raise ArgumentError("image_size", "is not positive everywhere", "pixels")
+    sizes = np.broadcast_to(sizes, (n, 2)).astype(np.float64)
+    outside = np.any((tracks.xy < -0.5 * sizes[tracks.view]), axis=1)
+    outside |= np.any(tracks.xy > 1.5 * sizes[tracks.view], axis=1)
+    if outside.mean() > 0.5:
+        was = "does not fit the tracks: most are far outside the images"
+        raise ArgumentError("image_size", was, "width, height in the pixels of the tracks")
+    if isinstance(shared, bool | np.bool_):
+        group = np.zeros(n, dtype=np.intp) if shared else np.arange(n)
+    else:
+        group = _groups(shared, n)
+    for c in range(int(group.max()) + 1):
+        if len(np.unique(sizes[group == c], axis=0)) > 1:
+            was = f"gives camera {c} images of different sizes"
+            raise ArgumentError("shared", was, "one size a camera; False for a camera a view")
+    return Images(sizes, group)
+
+
+def _groups(shared: ArrayLike, n: int) -> Indices:
+    group = as_array("shared", shared, "True, False or a number a view")
+    if group.shape != (n,) or group.dtype.kind not in "iu":
+        was = f"is {group.dtype} {group.shape}"
+        raise ArgumentError("shared", was, f"True, False, or integers ({n},)")
+    if (group < 0).any() or len(np.unique(group)) != int(group.max()) + 1:
+        raise ArgumentError("shared", "leaves numbers out", "cameras numbered from 0 without gaps")
+    return group.astype(np.intp)
