@@ -11,12 +11,13 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._arguments import as_count
+from epigauge._options import PairOptions, known_options
 from epigauge._results import Result
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._common import PathLike
@@ -161,7 +162,7 @@ def refine_database(
     backup: bool = True,
     workers: int = 1,
     progress: Callable[[int, int], object] | None = None,
-    **options: Any,
+    **options: Unpack[PairOptions],
 ) -> DatabaseResult:
     """Refine the fundamental matrix of every verified pair of a COLMAP database.
 
@@ -215,7 +216,7 @@ def refine_database(
     for name in _FROM_DATABASE:
         if name in options:
             raise ArgumentError(name, "is given", "none: the database holds what is used")
-    options.setdefault("noise_px", None)
+    known = {"noise_px": None} | known_options("refine_database", options, PairOptions)
     workers = as_count("workers", workers)
     with ColmapDatabase(path, write=write) as database:
         total = database.count()
@@ -224,7 +225,7 @@ def refine_database(
         parts: list[dict[str, Any]] = []
         done = 0
         for pairs in database.pairs():
-            parts.append(_refined(pairs, workers, _shifted(progress, done, total), options))
+            parts.append(_refined(pairs, workers, _shifted(progress, done, total), known))
             done += len(pairs)
         result = _joined(parts, database.names())
         accepted = np.array([verdict == "refined" for verdict in result.verdict])

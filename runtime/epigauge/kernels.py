@@ -18,7 +18,7 @@ import math
 import threading
 from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from epigauge_generated.signatures import SIGNATURES, Argument, Signature
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from epigauge._arguments import as_choice
 from epigauge._library import library
+from epigauge._options import Backend
 from epigauge.errors import BackendError
 
 __all__ = ["NAMES", "Table", "available", "backend", "set_backend", "table"]
@@ -49,7 +50,7 @@ class Table:
     """
 
     def __init__(self, name: str) -> None:
-        self.name = name
+        self.name = cast(Backend, name)
         wrap = {"c": _wrap_c, "numpy": _wrap_numpy, "casadi": _wrap_casadi}[name]
         for kernel, signature in SIGNATURES.items():
             setattr(self, kernel, wrap(kernel, signature))

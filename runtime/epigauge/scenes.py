@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +55,7 @@ def two_view_scene(
     baseline: float = 1.0,
     focal: float = 1000.0,
     cube: float = 1.0,
-    motion: str = "sideways",
+    motion: Literal["sideways", "forward"] = "sideways",
     seed: int = 0,
 ) -> TwoViewScene:
     """Simulate the two views of Bartoli and Sturm's experiments.

@@ -209,6 +209,26 @@ class TestCounts:
         assert (stopped.status, stopped.success, stopped.nit) == (-2, False, 1)
         assert stopped.cost == pytest.approx(result.history[1].cost, rel=1e-12)
 
+    @pytest.mark.parametrize("form", [*FORMS, {"loss": "huber"}, {"starts": 2}])
+    def test_a_callback_changes_nothing_and_stops_where_it_says(self, form) -> None:
+        """Whether it hears of each step or, after a compiled run, of all of them."""
+        x1, x2 = scene(noise_px=2.0)
+        rows: list[lm.Row] = []
+        free = eg.refine_fundamental(x1, x2, **form)
+        heard = eg.refine_fundamental(x1, x2, callback=rows.append, **form)
+        np.testing.assert_array_equal(heard.F, free.F)
+        assert (heard.nfev, heard.njev, heard.status) == (free.nfev, free.njev, free.status)
+        assert len(rows) == free.nfev
+        for last in (0, 2):
+            stopped = eg.refine_fundamental(
+                x1, x2, callback=lambda row, last=last: row.iteration == last, **form
+            )
+            assert (stopped.status, stopped.success) == (-2, False)
+            # Neither search goes on after the one that was stopped.
+            assert stopped.nit == last
+            accepted = [row.cost for row in rows[: last + 1] if row.accepted]
+            assert stopped.cost == pytest.approx(min(accepted), rel=1e-9)
+
     def test_default_tolerances_leave_nothing_that_shows(self) -> None:
         x1, x2 = scene()
         default = eg.refine_fundamental(x1, x2)

@@ -13,8 +13,8 @@ from epigauge import kernels
 from epigauge.scenes import two_view_scene
 from two_views import same_geometry
 
-#: The ways through the solver: the compiled loop over pairs, that over conditioned matches (which
-#: a callback needs), the readable one, other criteria, charts, structures and losses.
+#: The ways through the solver: the compiled loop over pairs (also with one who listens), the one
+#: over conditioned matches, the readable one, other criteria, charts, structures and losses.
 WAYS: dict[str, dict[str, Any]] = {
     "pairs": {},
     "callback": {"callback": lambda row: False},

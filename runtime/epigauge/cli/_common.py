@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Annotated, Any, ParamSpec
+from typing import Annotated, Any, ParamSpec, get_args
 
 import typer
 from rich.console import Console
@@ -33,6 +33,16 @@ INTERRUPTED = 130
 _running: ContextVar[str] = ContextVar("command", default="")
 
 Json = Annotated[bool, typer.Option("--json", help="Write one JSON document to stdout.")]
+
+
+def choice(names: Any, text: str) -> Any:
+    """Return an option of some names: help and completion show them, the library checks them."""
+    allowed = [str(name) for name in get_args(names)]
+
+    def similar(incomplete: str) -> list[str]:
+        return [name for name in allowed if name.startswith(incomplete)]
+
+    return typer.Option(help=text, parser=str, metavar="|".join(allowed), autocompletion=similar)
 
 
 def command(function: Callable[P, int]) -> Callable[P, None]:

@@ -9,11 +9,19 @@ from rich.console import Console
 from rich.markup import escape
 
 import epigauge as eg
+from epigauge._options import Method
 from epigauge.cli._common import shown
 from epigauge.cli.compare import exit_code, print_table
 
 _FLATNESS = 0.1
-_METHODS = ("free", "levenberg", "hartley", "bartoli", "mclauchlan", "covariant")
+_METHODS: tuple[Method, ...] = (
+    "free",
+    "levenberg",
+    "hartley",
+    "bartoli",
+    "mclauchlan",
+    "covariant",
+)
 _PICTURE = "epigauge-demo-many.png"
 
 

@@ -17,10 +17,12 @@ from rich.console import Console
 from rich.markup import escape
 
 import epigauge as eg
+from epigauge._options import Rigs as _Rigs
 from epigauge.cli._common import (
     DONE,
     INTERRUPTED,
     NOT_CONVERGED,
+    choice,
     console,
     facts,
     named,
@@ -50,7 +52,7 @@ FixView = Annotated[
     typer.Option(help="Number (from 0) or name of a view of a scene that is not moved; several."),
 ]
 Rigs = Annotated[
-    str, typer.Option(help="Poses of a COLMAP folder's rigs: keep (they must fit), or drop.")
+    _Rigs, choice(_Rigs, "Poses of a COLMAP folder's rigs; to keep them, they must fit.")
 ]
 ImageSize = Annotated[
     tuple[int, int] | None,

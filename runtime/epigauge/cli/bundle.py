@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import numpy as np
 import typer
@@ -14,12 +14,23 @@ from rich.markup import escape
 
 import epigauge as eg
 from epigauge._arguments import as_choice
+from epigauge._options import Backend as _Backend
+from epigauge._options import (
+    BundleDamping,
+    GaugeMode,
+    GaugeName,
+    Initialization,
+    Loss,
+    Method,
+)
+from epigauge._options import Repeated as _Repeated
 from epigauge.cli._common import (
     DONE,
     INTERRUPTED,
     NOT_CONVERGED,
     Json,
     check_target,
+    choice,
     console,
     facts,
     named,
@@ -52,16 +63,13 @@ from epigauge.multi_view.display import Display, display
 from epigauge.multi_view.pinhole import PinholeModel, pinhole_model
 from epigauge.verdicts import explained, usable
 
-_GAUGES = ("reference_camera", "two_cameras", "five_points", "normalized")
 #: Tracks in these files have y down, those of BAL problems y up.
 _Y_DOWN = (".npz", ".csv")
 
 Clean = Annotated[bool, typer.Option("--clean", help="Use only what the file marks as clean.")]
 MaxIter = Annotated[int, typer.Option(help="Trial steps allowed.")]
-Backend = Annotated[str | None, typer.Option(help="c, numpy or casadi; see `epigauge info`.")]
-Init = Annotated[
-    str, typer.Option(help="Start without --start: auto, registration or factorization.")
-]
+Backend = Annotated[_Backend | None, choice(_Backend, "See `epigauge info`.")]
+Init = Annotated[Initialization, choice(Initialization, "Start without --start.")]
 Prune = Annotated[
     bool,
     typer.Option(
@@ -69,8 +77,8 @@ Prune = Annotated[
     ),
 ]
 Repeated = Annotated[
-    str,
-    typer.Option(help="What --prune keeps of a point twice in a view: first, best or drop (none)."),
+    _Repeated,
+    choice(_Repeated, "What --prune keeps of a point twice in a view; drop: none of them."),
 ]
 Start = Annotated[Path | None, typer.Option(help="NPZ or BAL with cameras and points to begin at.")]
 TracksFile = Annotated[
@@ -84,15 +92,13 @@ TracksFile = Annotated[
 
 def bundle(
     tracks: TracksFile,
-    method: Annotated[str, typer.Option(help="Strategy; see `epigauge compare`.")] = "covariant",
-    damping: Annotated[str | None, typer.Option(help="Another than the method's own.")] = None,
-    gauge: Annotated[
-        str | None, typer.Option(help=f"Gauge to iterate in: {', '.join(_GAUGES)}.")
+    method: Annotated[Method, choice(Method, "Strategy.")] = "covariant",
+    damping: Annotated[
+        BundleDamping | None, choice(BundleDamping, "Another than the method's own.")
     ] = None,
-    gauge_mode: Annotated[str, typer.Option(help="explicit or implicit.")] = "explicit",
-    loss: Annotated[
-        str, typer.Option(help="linear, huber, soft_l1, cauchy or truncated.")
-    ] = "linear",
+    gauge: Annotated[GaugeName | None, choice(GaugeName, "Gauge to iterate in.")] = None,
+    gauge_mode: Annotated[GaugeMode, choice(GaugeMode, "How the gauge acts.")] = "explicit",
+    loss: Annotated[Loss, choice(Loss, "Of each squared residual.")] = "linear",
     robust: Annotated[
         bool,
         typer.Option(
@@ -160,7 +166,12 @@ def bundle(
     plots, outputs = plot or [], output or []
     if refine is not None or image_size is not None or is_scene(tracks):
         others = {"gauge": gauge, "start": start, "colmap": colmap, "clean": clean or None}
-        asked = {"method": method, "damping": damping, "loss": loss, "max_iter": max_iter}
+        asked: dict[str, Any] = {
+            "method": method,
+            "damping": damping,
+            "loss": loss,
+            "max_iter": max_iter,
+        }
         asked |= {"backend": backend, "gauge_mode": gauge_mode, "robust": robust}
         refuse_options(others)
         scene = SceneJob(tracks, refine, fix_view or [], rigs, y_up, image_size)
@@ -216,8 +227,8 @@ def first_reconstruction(
     file: TrackFile,
     tracks: Path,
     start: Path | None,
-    backend: str | None,
-    init: str = "auto",
+    backend: _Backend | None,
+    init: Initialization = "auto",
     robust: bool = False,
 ) -> eg.Reconstruction:
     """Return where to begin: what a file holds, or else two views and the others in turn."""
@@ -247,7 +258,7 @@ def gauge_named(name: str | None) -> eg.gauge.Gauge | None:
     """Return a gauge by its name."""
     if name is None:
         return None
-    gauge: eg.gauge.Gauge = getattr(eg.gauge, as_choice("gauge", name, _GAUGES))()
+    gauge: eg.gauge.Gauge = getattr(eg.gauge, as_choice("gauge", name, get_args(GaugeName)))()
     return gauge
 
 

@@ -19,11 +19,13 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 from rich.table import Table
 
+from epigauge._options import Backend, Loss
 from epigauge.cli._common import (
     BAD_INPUT,
     DONE,
     Json,
     check_target,
+    choice,
     console,
     facts,
     shown,
@@ -47,14 +49,10 @@ def colmap(
     backup: Annotated[
         bool, typer.Option(help="With --write: copy the database to DATABASE.bak first.")
     ] = True,
-    loss: Annotated[
-        str, typer.Option(help="linear, huber, soft_l1, cauchy or truncated.")
-    ] = "linear",
+    loss: Annotated[Loss, choice(Loss, "Of each squared residual.")] = "linear",
     max_iter: Annotated[int, typer.Option(help="Trial steps allowed a pair.")] = 100,
     workers: Annotated[int, typer.Option(help="Threads.")] = 1,
-    backend: Annotated[
-        str | None, typer.Option(help="c, numpy or casadi; see `epigauge info`.")
-    ] = None,
+    backend: Annotated[Backend | None, choice(Backend, "See `epigauge info`.")] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Save all pairs: CSV, or NPZ with more.")
     ] = None,

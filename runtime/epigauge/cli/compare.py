@@ -78,7 +78,7 @@ def compare(
         observed = SceneJob(tracks, refine, fix_view or [])
     else:
         observed = load_track_file(tracks, clean, prune=repeated if prune else None)
-    chosen = methods if methods == "all" else [name.strip() for name in methods.split(",")]
+    chosen: Any = methods if methods == "all" else [name.strip() for name in methods.split(",")]
     with watching(out, len(observed.tracks), "first reconstruction", not json) as watch:
         options: dict[str, Any] = {"max_iter": max_iter, "backend": backend}
         if isinstance(observed, SceneJob):

@@ -10,7 +10,8 @@ import numpy as np
 import typer
 
 import epigauge as eg
-from epigauge.cli._common import Json, check_target
+from epigauge._options import Backend, FrontEnd
+from epigauge.cli._common import Json, check_target, choice
 from epigauge.cli.refine import FROM_FILE, finish, warn_of_marks
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import load_matches
@@ -20,7 +21,7 @@ def estimate(
     matches: Annotated[
         Path, typer.Argument(help="CSV, TXT or NPZ: x1, y1, x2, y2 in pixels.", show_default=False)
     ],
-    robust: Annotated[str, typer.Option(help="Robust start: auto, poselib or opencv.")] = "auto",
+    robust: Annotated[FrontEnd, choice(FrontEnd, "Robust start.")] = "auto",
     threshold_px: Annotated[
         float | None,
         typer.Option(
@@ -36,9 +37,7 @@ def estimate(
     ] = None,
     max_iter: Annotated[int, typer.Option(help="Trial steps allowed.")] = 100,
     seed: Annotated[int, typer.Option(help="Of the random samples.")] = 0,
-    backend: Annotated[
-        str | None, typer.Option(help="c, numpy or casadi; see `epigauge info`.")
-    ] = None,
+    backend: Annotated[Backend | None, choice(Backend, "See `epigauge info`.")] = None,
     inliers: Annotated[
         bool, typer.Option("--inliers", help="Use only the matches the file marks as inliers.")
     ] = False,

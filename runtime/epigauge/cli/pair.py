@@ -12,11 +12,13 @@ import typer
 from rich.markup import escape
 
 import epigauge as eg
+from epigauge._options import Backend, Detector, FrontEnd
 from epigauge.cli._common import (
     DONE,
     NOT_CONVERGED,
     Json,
     check_target,
+    choice,
     console,
     facts,
     named,
@@ -39,9 +41,7 @@ def pair(
         Path, typer.Argument(help="First photograph: JPEG, PNG, TIFF ...", show_default=False)
     ],
     image2: Annotated[Path, typer.Argument(help="Second photograph.", show_default=False)],
-    detector: Annotated[
-        str, typer.Option(help="Features: sift, orb, akaze, brisk or kaze.")
-    ] = "sift",
+    detector: Annotated[Detector, choice(Detector, "Features.")] = "sift",
     ratio: Annotated[
         float, typer.Option(help="Largest ratio of the nearest to the second nearest descriptor.")
     ] = 0.8,
@@ -53,7 +53,7 @@ def pair(
         ),
     ] = 2400,
     max_features: Annotated[int, typer.Option(help="Strongest features kept.")] = 8000,
-    robust: Annotated[str, typer.Option(help="Robust start: auto, poselib or opencv.")] = "auto",
+    robust: Annotated[FrontEnd, choice(FrontEnd, "Robust start.")] = "auto",
     threshold_px: Annotated[
         float | None,
         typer.Option(
@@ -69,9 +69,7 @@ def pair(
     ] = None,
     max_iter: Annotated[int, typer.Option(help="Trial steps allowed.")] = 100,
     seed: Annotated[int, typer.Option(help="Of the random samples.")] = 0,
-    backend: Annotated[
-        str | None, typer.Option(help="c, numpy or casadi; see `epigauge info`.")
-    ] = None,
+    backend: Annotated[Backend | None, choice(Backend, "See `epigauge info`.")] = None,
     plot: Annotated[
         Path | None, typer.Option(help="Draw a picture: PNG or SVG; or write a report: HTML.")
     ] = None,

@@ -13,11 +13,13 @@ from rich.markup import escape
 from rich.table import Table
 
 import epigauge as eg
+from epigauge._options import Backend, Criterion, Hessian, Parameterization, Structure
 from epigauge.cli._common import (
     DONE,
     NOT_CONVERGED,
     Json,
     check_target,
+    choice,
     console,
     facts,
     shown,
@@ -37,10 +39,14 @@ def refine(
     matches: Annotated[
         Path, typer.Argument(help="CSV, TXT or NPZ: x1, y1, x2, y2 in pixels.", show_default=False)
     ],
-    parameterization: Annotated[str, typer.Option(help="How F is represented.")] = "ortho",
-    criterion: Annotated[str, typer.Option(help="What is minimised.")] = "reprojection",
-    structure: Annotated[str, typer.Option(help="eliminated or joint.")] = "eliminated",
-    hessian: Annotated[str, typer.Option(help="exact or gauss-newton.")] = "exact",
+    parameterization: Annotated[
+        Parameterization, choice(Parameterization, "How F is represented.")
+    ] = "ortho",
+    criterion: Annotated[Criterion, choice(Criterion, "What is minimised.")] = "reprojection",
+    structure: Annotated[
+        Structure, choice(Structure, "What becomes of the points.")
+    ] = "eliminated",
+    hessian: Annotated[Hessian, choice(Hessian, "Of the cost over F.")] = "exact",
     noise_px: Annotated[
         float | None,
         typer.Option(
@@ -49,9 +55,7 @@ def refine(
         ),
     ] = None,
     max_iter: Annotated[int, typer.Option(help="Trial steps allowed.")] = 100,
-    backend: Annotated[
-        str | None, typer.Option(help="c, numpy or casadi; see `epigauge info`.")
-    ] = None,
+    backend: Annotated[Backend | None, choice(Backend, "See `epigauge info`.")] = None,
     inliers: Annotated[
         bool, typer.Option("--inliers", help="Use only the matches the file marks as inliers.")
     ] = False,

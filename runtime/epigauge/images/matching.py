@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge._arguments import as_choice, as_count, as_positive
+from epigauge._options import Detector
 from epigauge.errors import ArgumentError
 from epigauge.images.loading import Image, as_image, opencv
 from epigauge.io import Matches
@@ -58,7 +59,7 @@ def match_images(
     image1: PathLike | ArrayLike,
     image2: PathLike | ArrayLike,
     *,
-    detector: str = "sift",
+    detector: Detector = "sift",
     ratio: float = 0.8,
     max_size: int = 2400,
     max_features: int = 8000,

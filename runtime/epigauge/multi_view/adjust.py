@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import kernels, lm
 from epigauge._arguments import as_choice, as_count, as_positive
+from epigauge._logged import logged
+from epigauge._options import Backend, BundleDamping, GaugeMode, Method, Schedule
+from epigauge._options import Loss as LossName
 from epigauge._results import Result
 from epigauge.bundle.dampings import DAMPINGS
 from epigauge.bundle.jobs import AnyReconstruction, job_of
@@ -155,6 +158,7 @@ class BundleResult(Result):
         return plot_bundle(self, tracks, title, **options)
 
 
+@logged
 @merging_sightings
 def bundle_adjust(
     tracks: Tracks,
@@ -164,22 +168,22 @@ def bundle_adjust(
     fixed_views: Iterable[int] = (),
     fixed_points: Iterable[int] = (),
     priors: Iterable[Prior] | None = None,
-    noise_px: float | str | None = "tracks",
-    method: str = "covariant",
+    noise_px: float | Literal["tracks"] | None = "tracks",
+    method: Method = "covariant",
     gauge: Gauge | type[Gauge] | None = None,
-    gauge_mode: str = "explicit",
-    damping: str | None = None,
+    gauge_mode: GaugeMode = "explicit",
+    damping: BundleDamping | None = None,
     embedded: bool = True,
-    schedule: str = "auto",
+    schedule: Schedule = "auto",
     robust: bool = False,
-    loss: str = "linear",
-    loss_scale_px: float | str = "auto",
+    loss: LossName = "linear",
+    loss_scale_px: float | Literal["auto"] = "auto",
     ftol: float = 1e-8,
     xtol: float = 0.0,
     gtol: float = 0.0,
     max_iter: int = 100,
     workers: int = 1,
-    backend: str | None = None,
+    backend: Backend | None = None,
     callback: Callable[[lm.Row], object] | None = None,
 ) -> BundleResult:
     """Minimise the reprojection error of cameras and points.

@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, Unpack, cast
 
 from epigauge import lm
 from epigauge._arguments import as_choice
+from epigauge._options import AdjustOptions, Method, known_options
 from epigauge._results import Result
 from epigauge.bundle.run import PROJECTIVE_ONLY
 from epigauge.bundle.strategies import STRATEGIES
@@ -116,11 +117,11 @@ class Comparison(Result):
 
 def compare(
     tracks: Tracks,
-    methods: str | Sequence[str] = "all",
+    methods: Literal["all"] | Sequence[Method] = "all",
     start: Reconstruction | MetricReconstruction | None = None,
     *,
     on_method: Callable[[str], object] | None = None,
-    **options: Any,
+    **options: Unpack[AdjustOptions],
 ) -> Comparison:
     """Adjust the same tracks from the same start by several methods.
 
@@ -148,7 +149,8 @@ def compare(
     ArgumentError
         On unknown or repeated names, and as `bundle_adjust`.
     """
-    names = methods
+    known = known_options("compare", options, AdjustOptions)
+    names: str | Sequence[str] = methods
     if methods == "all":
         metric = isinstance(start, MetricReconstruction)
         names = [name for name in STRATEGIES if not (metric and name in PROJECTIVE_ONLY)]
@@ -156,14 +158,15 @@ def compare(
         raise ArgumentError("methods", f"is {methods!r}", '"all" or a list of different names')
     for name in names:
         as_choice("methods", name, STRATEGIES)
+    chosen = cast(Sequence[Method], names)
     if start is None:
-        start = initialize(tracks, backend=options.get("backend"))
+        start = initialize(tracks, backend=known.get("backend"))
     rows: list[ComparedMethod] = []
-    for name in names:
+    for name in chosen:
         if on_method is not None and on_method(name) and rows:
             break
         begin = time.perf_counter()
-        result = bundle_adjust(tracks, start, method=name, **options)
+        result = bundle_adjust(tracks, start, method=name, **known)
         seconds = time.perf_counter() - begin
         rows.append(
             ComparedMethod(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from epigauge import lm
 from epigauge._arguments import as_choice, as_count
+from epigauge._options import Backend, Initialization
 from epigauge.bundle.dampings import Covariant
 from epigauge.bundle.moves import best_conditioned
 from epigauge.bundle.observations import ObservationGraph
@@ -39,11 +40,11 @@ _TRIES, _TRIED, _SAME = 12, 40, 0.02
 def initialize(
     tracks: Tracks,
     *,
-    method: str = "auto",
+    method: Initialization = "auto",
     incremental: bool = False,
     robust: bool = False,
     seed: int = 0,
-    backend: str | None = None,
+    backend: Backend | None = None,
 ) -> Reconstruction:
     """Reconstruct without a start, well enough for `bundle_adjust` to begin from.
 

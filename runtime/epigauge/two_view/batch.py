@@ -6,13 +6,15 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge import lm
 from epigauge._arguments import as_array, as_count, as_matches, as_real, as_weights
+from epigauge._logged import logged
+from epigauge._options import PairOptions, known_options
 from epigauge.errors import ArgumentError
 from epigauge.two_view import native, quick
 from epigauge.two_view._partial import Partial
@@ -101,6 +103,7 @@ class FundamentalBatch(Partial):
         return {f"pair {k}": reason for k, reason in list(self.reasons.items())[:5]}
 
 
+@logged
 def refine_fundamental_batch(
     x1: ArrayLike,
     x2: ArrayLike,
@@ -111,7 +114,7 @@ def refine_fundamental_batch(
     workers: int = 1,
     progress: Callable[[int, int], object] | None = None,
     flags: bool = False,
-    **options: Any,
+    **options: Unpack[PairOptions],
 ) -> FundamentalBatch:
     """Refine the fundamental matrices of many pairs, each as by `refine_fundamental`.
 
@@ -154,8 +157,9 @@ def refine_fundamental_batch(
     starts = None if F0 is None else np.ascontiguousarray(as_real("F0", F0, needed))
     if starts is not None and starts.shape != (count, 3, 3):
         raise ArgumentError("F0", f"has shape {starts.shape}", f"({count}, 3, 3)")
-    _check_options(options)
-    work = _Work(x1, x2, bounds, starts, w, options)
+    known = known_options("refine_fundamental_batch", options, PairOptions)
+    _check_options(known)
+    work = _Work(x1, x2, bounds, starts, w, known)
     size = 1 if work.plan.native is None else _CHUNK
     chunks = [range(first, min(first + size, count)) for first in range(0, count, size)]
     done = 0

@@ -85,8 +85,12 @@ def express(
     complete = partial(completed, pair, 0, x1, x2, kept, options, noise_px)
     if options.criterion != "reprojection":
         return FundamentalResult.partial(known, complete)
+
+    def history() -> SimpleNamespace:
+        return SimpleNamespace(history=lm.rows(pair.history[:nfev], scale**2))
+
     judge = partial(_judged, pair, x1, x2, kept)
-    return FundamentalResult.partial(known, complete, flags=judge, success=judge)
+    return FundamentalResult.partial(known, complete, flags=judge, success=judge, history=history)
 
 
 def _judged(pair: native.Pair, x1: Array, x2: Array, weights: Array | None) -> SimpleNamespace:

@@ -1,7 +1,7 @@
 """The same minimisation by the compiled loop: for charts of F alone, and whole pairs in pixels.
 
 `solve`, `eliminated` and `lm` are the readable reference; tests compare both row by row of the
-history. What the compiled loop does not know is left to them: callbacks, MAPS, covariances of the
+history. What the compiled loop does not know is left to them: MAPS, covariances of the
 points, joint structure.
 """
 
@@ -114,6 +114,8 @@ def minimize(
     loss_scale: float,
     stopping: lm.Stopping,
     scale: float,
+    *,
+    at_most: int | None = None,
 ) -> lm.Outcome[Any]:
     """Minimise over conditioned matches, as `lm.minimize` does with an `EliminatedProblem`.
 
@@ -129,6 +131,8 @@ def minimize(
         Criterion, loss, damping, and whether the Hessian is exact.
     loss_scale, stopping, scale
         Scale of the loss in the unit of the matches; the others as in `lm.minimize`.
+    at_most : int, optional
+        Trial steps, in place of those of `stopping`; may be zero.
 
     Returns
     -------
@@ -140,10 +144,11 @@ def minimize(
     kind, basis, entries = parts
     criterion, loss, damping, exact = choices
     options = _options(criterion, kind, loss, exact, damping, loss_scale, stopping)
+    options.max_iter = stopping.max_iter if at_most is None else at_most
     motion = np.zeros(22)
     packed = np.concatenate([np.ravel(part) for part in start])
     motion[: len(packed)] = packed
-    history = np.empty((stopping.max_iter + 1, _ROW))
+    history = np.empty((options.max_iter + 1, _ROW))
     outcome = _Outcome()
     p = chart.dimension
     q1, q2, weights = matches

@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +22,17 @@ from epigauge._arguments import (
     as_positive,
     as_weights,
     check_general_position,
+)
+from epigauge._logged import logged
+from epigauge._options import (
+    Backend,
+    Criterion,
+    Hessian,
+    Loss,
+    PairDamping,
+    Parameterization,
+    Part,
+    Structure,
 )
 from epigauge.errors import ArgumentError
 from epigauge.two_view import native
@@ -40,7 +51,7 @@ from epigauge.two_view.parameterizations import (
     Ortho,
 )
 from epigauge.two_view.result import FundamentalResult
-from epigauge.two_view.solve import DAMPINGS, REDUNDANT, Matches, Options
+from epigauge.two_view.solve import DAMPINGS, REDUNDANT, Matches, Options, stop_of
 
 __all__ = ["calibrations", "refine_fundamental"]
 
@@ -50,23 +61,24 @@ Array = NDArray[np.float64]
 _ESSENTIAL_STARTS = 5
 
 
+@logged
 def refine_fundamental(
     x1: ArrayLike,
     x2: ArrayLike,
     F0: ArrayLike | None = None,
     *,
-    parameterization: str = "ortho",
-    criterion: str = "reprojection",
-    structure: str = "eliminated",
-    damping: str = "levenberg",
-    hessian: str = "exact",
+    parameterization: Parameterization = "ortho",
+    criterion: Criterion = "reprojection",
+    structure: Structure = "eliminated",
+    damping: PairDamping = "levenberg",
+    hessian: Hessian = "exact",
     starts: int = 1,
-    fix: str | Sequence[str] = (),
+    fix: Part | Sequence[Part] = (),
     essential: bool = False,
     K1: ArrayLike | None = None,
     K2: ArrayLike | None = None,
-    loss: str = "linear",
-    loss_scale_px: float | str = "auto",
+    loss: Loss = "linear",
+    loss_scale_px: float | Literal["auto"] = "auto",
     noise_px: float | None = None,
     weights: ArrayLike | None = None,
     covariance1: ArrayLike | None = None,
@@ -76,7 +88,7 @@ def refine_fundamental(
     xtol: float = 1e-12,
     gtol: float = 1e-14,
     max_iter: int = 100,
-    backend: str | None = None,
+    backend: Backend | None = None,
     callback: Callable[[lm.Row], object] | None = None,
 ) -> FundamentalResult:
     """Find the fundamental matrix that minimises the reprojection error of point matches.
@@ -157,7 +169,8 @@ def refine_fundamental(
     backend : {"c", "numpy", "casadi"}, optional
         Where the formulas are computed; by default `epigauge.backend()`.
     callback : callable, optional
-        Called with each row of the history; a true return value stops (status -2).
+        Called with each row of the history; a true return value stops (status -2). A compiled
+        minimisation is over before it is told of, and is repeated up to the row that stops it.
 
     Returns
     -------
@@ -188,11 +201,14 @@ def refine_fundamental(
         *(fix, bias_correction, ftol, xtol, gtol, max_iter, starts, noise_px, backend),
     )
     options, noise_px, starts = plan.options, plan.noise_px, plan.starts
-    special = essential or K1 is not None or K2 is not None or callback is not None
+    special = essential or K1 is not None or K2 is not None
     if plan.native is not None and not special and covariance1 is None and covariance2 is None:
         result = _express(x1, x2, F0, weights, plan)
-        if result is not None:
+        wanted = None if result is None or callback is None else stop_of(result.history, callback)
+        if result is not None and wanted is None:
             return result
+        if wanted is not None:  # which has been told of the rows up to there
+            callback = _stopping_at(wanted)
     options = replace(options, calibration=calibrations(essential, K1, K2))
     least = 8 if options.calibration is None else 5
     x1, x2 = as_matches(x1, x2, at_least=least, general_position=True)
@@ -213,6 +229,10 @@ def refine_fundamental(
     options = replace(options, anchor=start if options.fix else None)
     found = search(matches, options, _starts(matches, options, start, starts), callback)
     return assembled(found, options, matches, noise_px)
+
+
+def _stopping_at(iteration: int) -> Callable[[lm.Row], object]:
+    return lambda row: row.iteration >= iteration
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,15 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
 from epigauge._arguments import as_choice, as_count, as_matches, as_positive
+from epigauge._logged import logged
+from epigauge._options import FrontEnd, RefineOptions, known_options
 from epigauge.errors import ArgumentError, MissingPackageError
 from epigauge.two_view.chance import CEILING
 from epigauge.two_view.conditioning import RMS, condition
@@ -96,14 +98,15 @@ class RobustResult(FundamentalResult):
         return {"F": found.pop("F"), "inliers": count} | found
 
 
+@logged
 def estimate_fundamental(
     x1: ArrayLike,
     x2: ArrayLike,
     *,
-    robust: str = "auto",
-    threshold_px: float | str = "auto",
+    robust: FrontEnd = "auto",
+    threshold_px: float | Literal["auto"] = "auto",
     seed: int = 0,
-    **options: Any,
+    **options: Unpack[RefineOptions],
 ) -> RobustResult:
     """Find the fundamental matrix of raw matches, gross errors among them.
 
@@ -149,6 +152,19 @@ def estimate_fundamental(
     estimates of random subsets of the inliers, until that finds nothing higher. Matches that
     violate the oriented epipolar constraint count as wrong.
     """
+    known = known_options("estimate_fundamental", options, RefineOptions, ("F0",))
+    return _estimated(x1, x2, robust, threshold_px, seed, known)
+
+
+def _estimated(
+    x1: ArrayLike,
+    x2: ArrayLike,
+    robust: str,
+    threshold_px: float | str,
+    seed: int,
+    options: dict[str, Any],
+) -> RobustResult:
+    """Find the fundamental matrix, options being those of `refine_fundamental`."""
     calibration = calibrations(
         bool(options.get("essential", False)), options.get("K1"), options.get("K2")
     )

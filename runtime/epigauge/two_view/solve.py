@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -218,9 +219,10 @@ def _minimize_once(
     scale_px = 0.0 if options.loss_scale_px is None else options.loss_scale_px
     loss = options.scaled_loss(scale_px / matches.frame.scale)
     chart = _chart(matches, options, start)
-    if _is_native(matches, options, chart, callback):
+    if _is_native(matches, options, chart):
         exact = options.hessian == "exact"
-        compiled = native.minimize(
+        run = partial(
+            native.minimize,
             chart,
             chart.start(start),
             (matches.q1, matches.q2, matches.weights),
@@ -229,6 +231,11 @@ def _minimize_once(
             options.stopping,
             matches.frame.scale**2,
         )
+        compiled = run()
+        last = None if callback is None else stop_of(compiled.history, callback)
+        if last is not None:
+            told = tuple(row for row in compiled.history if row.iteration <= last)
+            compiled = replace(run(at_most=last), status=-2, history=told)
         motion = compiled.state.motion
         return Solution(chart.fundamental(motion), chart, motion, compiled, scale_px)
     problem = _problem(matches, options, chart, loss)
@@ -253,15 +260,15 @@ def _minimize_once(
     return Solution(F, chart, motion, outcome, scale_px)
 
 
-def _is_native(
-    matches: Matches,
-    options: Options,
-    chart: Parameterization,
-    callback: Callable[[lm.Row], object] | None,
-) -> bool:
+def stop_of(history: tuple[lm.Row, ...], callback: Callable[[lm.Row], object]) -> int | None:
+    """Tell a callback of a minimisation that is over; return the iteration that it stops at."""
+    return next((row.iteration for row in history if callback(row)), None)
+
+
+def _is_native(matches: Matches, options: Options, chart: Parameterization) -> bool:
     """Tell whether the compiled loop does the same, sooner."""
     over_F = options.structure == "eliminated" and options.parameterization not in REDUNDANT
-    plain = matches.table.name == "c" and matches.covariances is None and callback is None
+    plain = matches.table.name == "c" and matches.covariances is None
     return over_F and plain and native.supports(options.criterion, chart)
 
 
