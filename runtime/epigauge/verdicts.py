@@ -103,6 +103,37 @@ FLAGS = {
         "add matches or views that fix them, or hold them fixed",
         ("F", "E", "views"),
     ),
+    "not tied": Flag(
+        "the views or points fall into parts that share nothing that counts: each part has a frame "
+        "and a scale of its own",
+        "add points that both parts see, or reconstruct the parts one by one",
+        ("views",),
+    ),
+    "two-view tracks": Flag(
+        "no point is seen by more than two views, and the pairs do not fix all cameras: in a "
+        "chain, a star or a ring, scales (of uncalibrated cameras more) are open",
+        "match points over three views or more, or more pairs of views",
+        ("views",),
+    ),
+    "open intrinsics": Flag(
+        "a focal length, principal point or distortion is open, or uncertain by more than a tenth "
+        "of the focal length: a flat, distant or narrow scene, or views that all look one way",
+        "hold those intrinsics (refine=...), give an IntrinsicPrior, or turn the camera",
+    ),
+    "flat scene": Flag(
+        "all points lie in one plane within the noise, and intrinsics are refined: they lean on "
+        "how the views are slanted alone",
+        "match points off the plane, or hold the intrinsics",
+    ),
+    "collinear centres": Flag(
+        "all centres of the cameras are on one line: known positions leave the turn about it open, "
+        "and intrinsics are weak",
+        "take images beside the line, or know a point or a rotation",
+    ),
+    "points at infinity": Flag(
+        "the noise leaves the depth of many points open: they may as well be infinitely far",
+        "use their directions, not their places; or take images farther apart",
+    ),
     "gross errors": Flag(
         "a few matches carry most of the error: wrong ones among them, which least squares bends "
         "the result to",
@@ -110,6 +141,11 @@ FLAGS = {
         "(`--inliers`); in tracks, set the wrong ones aside with robust=True (`epigauge bundle "
         "--robust`)",
         ("F", "E", "views"),
+    ),
+    "outliers": Flag(
+        "more residuals are beyond four standard deviations than noise explains: gross errors are "
+        "left, which pull at the result",
+        "set them aside with robust=True (`epigauge bundle --robust`), or use a robust loss",
     ),
     "behind the cameras": Flag(
         "some points lie behind a camera",
@@ -132,7 +168,8 @@ FLAGS = {
     "near-affine": Flag(
         "an affine model explains the matches within the noise: perspective does not show, and "
         "several minima are possible",
-        "use several starts (starts=20), or images with more perspective",
+        "use several starts (starts=20), or images with more perspective; of many views, an affine "
+        "reconstruction says as much",
     ),
     "few matches": Flag(
         "so few more matches than parameters that the noise cannot be estimated to 25 %",

@@ -496,7 +496,7 @@ def test_what_nothing_determines_is_named() -> None:
     tracks, start = scene("FULL_OPENCV", params, m=40)
     tracks = eg.Tracks(tracks.view, tracks.point, start.project(tracks))
     found = eg.bundle_adjust(tracks, start)
-    assert found.flags == ("undetermined",)
+    assert found.flags == ("undetermined", "open intrinsics")
     assert found.weakest.endswith("(undetermined)")
     named = {part.split(" of view")[0] for part in found.weakest.split(", ")}
     assert named <= {f"k{k}" for k in range(1, 7)}

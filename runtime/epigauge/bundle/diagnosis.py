@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,13 @@ class Diagnosis:
         Own tangents of that weakest direction, one standard deviation long for a noise of one.
     open : ndarray, shape (n, d), or None
         A direction that nothing determines, as far as each entry moves images.
+    spread : ndarray, shape (n, d)
+        Least standard deviations of own tangents for a noise of one: those along the weakest few
+        directions together.
+    points : ndarray, shape (m, b)
+        How the points go with the weakest direction, or with the open one.
+    gauge : int
+        Motions of the gauge that nothing holds.
     """
 
     rank: int
@@ -56,6 +64,9 @@ class Diagnosis:
     condition: float
     cameras: Array
     open: Array | None = None
+    spread: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    points: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    gauge: int = 0
 
 
 def diagnosed(
@@ -87,11 +98,13 @@ def diagnosed(
     unknowns = n * a - frozen + r + 3 * int(np.count_nonzero(free))
     gauge = _free_gauge(system, kernels) if fixes_gauge else system.model.gauge_dimension
     nothing = np.zeros((n, d))
+    silent: dict[str, Any] = {"spread": nothing, "points": np.zeros((len(free), 3))}
+    silent["gauge"] = gauge
     if not system.normal.coupling.direct:
-        return Diagnosis(unknowns - gauge - of_points, 0, float("inf"), nothing)
+        return Diagnosis(unknowns - gauge - of_points, 0, float("inf"), nothing, **silent)
     factored = _factored(system, ties, W.points, white)
     if factored is None:
-        return Diagnosis(unknowns - gauge - of_points - 1, 1, float("inf"), nothing)
+        return Diagnosis(unknowns - gauge - of_points - 1, 1, float("inf"), nothing, **silent)
     shifted, shift = factored
     count = min(gauge + _COLUMNS, n * a - frozen + r)
     X = np.random.default_rng(0).standard_normal((n * a + r, count))
@@ -110,12 +123,31 @@ def diagnosed(
     if missing:
         x, s = X[: n * a, :open_].reshape(n, a, open_), X[n * a :, :open_]
         found = _beside_gauge(system, kernels, ties.cameras(x, s))
+        size = np.sqrt(np.einsum("nii->ni", system.normal.U))
+        free = size > 0.0
+        silent["points"] = _followed(system, np.where(free, found / np.where(free, size, 1.0), 0.0))
     if first >= count:
-        return Diagnosis(rank, missing, float("inf"), nothing, found)
-    value = float(max(values[first], _ROUNDING))
-    x, s = X[: n * a, first].reshape(n, a, 1), X[n * a :, first, None]
-    weakest = ties.cameras(x, s)[..., 0] / np.sqrt(value)
-    return Diagnosis(rank, missing, 1.0 / value, weakest, found)
+        return Diagnosis(rank, missing, float("inf"), nothing, found, **silent)
+    size = np.maximum(values[first:], _ROUNDING)
+    x, s = X[: n * a, first:].reshape(n, a, -1), X[n * a :, first:]
+    own = ties.cameras(x, s) / np.sqrt(size)
+    silent["spread"] = np.linalg.norm(own, axis=2)
+    if found is None:
+        silent["points"] = _followed(system, own[..., 0])
+    return Diagnosis(rank, missing, 1.0 / float(size[0]), own[..., 0], found, **silent)
+
+
+def _followed(system: BundleSystem, own: Array) -> Array:
+    """Return where the points go with cameras moving by own tangents (n, d): -V^-1 W^T x."""
+    blocks = system.normal.V + 1e-12 * _sizes(system.normal.V)
+    pull = system.normal.coupling.to_points(None, np.ascontiguousarray(own))
+    return -np.asarray(np.linalg.solve(blocks, pull[..., None])[..., 0])
+
+
+def _sizes(blocks: Array) -> Array:
+    """Return unit matrices as large as blocks (m, b, b)."""
+    traces = np.einsum("mii->m", blocks)[:, None, None]
+    return np.asarray(np.maximum(traces, 1e-300) * np.eye(blocks.shape[1]))
 
 
 def _beside_gauge(system: BundleSystem, kernels: Table, own: Array) -> Array:

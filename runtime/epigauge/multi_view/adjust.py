@@ -89,8 +89,9 @@ class BundleResult(Result):
         metric cameras scaled to a unit diagonal, of projective ones where the W of the covariant
         damping is one. Infinite where something is undetermined or the system is not factored.
     weakest : str
-        Of metric and affine cameras the direction of that eigenvalue: its three largest standard
-        deviations, as shares of a radian, of the scene's size, or of the focal length.
+        The direction of that eigenvalue in words: of metric and affine cameras its three largest
+        standard deviations, as shares of a radian, of the scene's size, or of the focal length, and
+        the group of points that moves with it; of projective ones the views with most part in it.
         Where nothing determines a direction, what moves most along it.
     nfev, njev, nit, status, message, success, history
         As in `FundamentalResult`.
@@ -381,7 +382,7 @@ def bundle_adjust(
             predicted, depths = reconstruction.seen(tracks)
         else:
             predicted, depths = reconstruction.project(tracks), None
-        free = fixed, job.fixes_gauge or reference
+        free = fixed, job.fixes_gauge or reference, predicted, loss == "linear"
         verdict = judged_metric(tracks, reconstruction, depths, outcome, table, *free)
     else:
         linear = loss == "linear"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from epigauge.multi_view.seen import Seen
 
-__all__ = ["Homographies", "fit_homographies", "parallax_flags"]
+__all__ = ["Homographies", "fit_homographies", "parallax_flags", "partners"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -82,7 +82,7 @@ def parallax_flags(seen: Seen, noise_px: float) -> tuple[str, ...]:
 
 def _plainly_off(seen: Seen, limit: float) -> bool:
     """Tell whether a first pair, of views far from each other in a sequence, shows parallax."""
-    others = _partners(seen, np.searchsorted(seen.point, np.arange(seen.m + 1)), 0)
+    others = partners(seen, np.searchsorted(seen.point, np.arange(seen.m + 1)), 0)
     if not len(others):
         return False
     x1, x2, first = _matches(seen, np.array([[0, others.max()]]))
@@ -90,7 +90,7 @@ def _plainly_off(seen: Seen, limit: float) -> bool:
     return bool(np.mean(off) > _MOSTLY)
 
 
-def _partners(seen: Seen, begin: Indices, i: int) -> Indices:
+def partners(seen: Seen, begin: Indices, i: int) -> Indices:
     """Return views with points in common with view i: with the fewest, with some, with the most."""
     own = seen.point[seen.view == i]
     lengths = begin[own + 1] - begin[own]
@@ -115,7 +115,7 @@ def _pairs(seen: Seen) -> Iterator[Indices]:
     for some in (asked[k::stride] for k in range(stride)):
         chosen: list[tuple[int, int]] = []
         for i in some.tolist():
-            chosen += [(i, k) for k in _partners(seen, begin, i).tolist()]
+            chosen += [(i, k) for k in partners(seen, begin, i).tolist()]
         if chosen:
             yield np.array(chosen)
 

@@ -51,6 +51,14 @@ class Seen:
         return len(self.Q)
 
     @staticmethod
+    def of_network(tracks: Tracks) -> Seen:
+        """Return what counts of tracks alone, numbers kept, with zeros for cameras and points."""
+        counts = tracks.weights > 0.0
+        n, m = tracks.n_views, tracks.n_points
+        arrays = tracks.xy[counts], tracks.weights[counts], np.zeros((n, 3, 4)), np.zeros((m, 4))
+        return Seen(tracks.view[counts], tracks.point[counts], *arrays, np.arange(n))
+
+    @staticmethod
     def of(tracks: Tracks, found: Reconstruction, rejected: Mask) -> tuple[Seen, int]:
         """Return what counts, and how many views lost all that would have."""
         counts = ~rejected & (tracks.weights > 0.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["has_gross_errors"]
+__all__ = ["gross_flags", "has_gross_errors"]
 
 Array = NDArray[np.float64]
 
@@ -21,6 +21,39 @@ _EXACT = 1e-8
 #: a thousand. So few as the second cannot: one of 35000 measured ones is off by a third of the
 #: extent, and they lead to the published optimum all the same.
 _BEYOND, _TOO_FEW = 0.2, 1e-4
+
+#: Residuals near the noise and far from it, in standard deviations. Measured sets have tails: most
+#: of what is beyond the first is within the second, where gross errors stand apart. Shares of both
+#: that are told whatever the other is, and least number and share of those apart.
+_NEAR, _FAR = 4.0, 12.0
+_MANY_NEAR, _MANY_FAR, _APART, _FEW, _FEW_SHARE = 0.08, 0.02, 1.5, 3, 0.002
+
+
+def gross_flags(distances: Array, noise_px: float, xy: Array) -> tuple[str, ...]:
+    """Return "gross errors" where they spoil least squares, "outliers" where some are left.
+
+    Parameters
+    ----------
+    distances : ndarray, shape (N,)
+        Lengths of the residuals that count, times the roots of their weights.
+    noise_px : float
+        Standard deviation of a coordinate, as their median tells it.
+    xy : ndarray, shape (N, 2)
+        Where they were measured.
+    """
+    if has_gross_errors(distances, noise_px, xy):
+        return ("gross errors",)
+    if distances.max() <= _NEAR * noise_px:
+        return ()
+    usual, N = max(noise_px, _EXACT * _extent(xy)), len(distances)
+    near, far = (int(np.count_nonzero(distances > k * usual)) for k in (_NEAR, _FAR))
+    # Of normal errors exp(-8) are beyond four standard deviations.
+    chance = N * float(np.exp(-0.5 * _NEAR**2))
+    if near <= chance + 5.0 * max(chance, 1.0) ** 0.5:
+        return ()
+    apart = far >= max(_FEW, _FEW_SHARE * N) and near <= _APART * far
+    left = apart or near > _MANY_NEAR * N or far > _MANY_FAR * N
+    return ("outliers",) if left else ()
 
 
 def has_gross_errors(distances: Array, noise_px: float, xy: Array) -> bool:

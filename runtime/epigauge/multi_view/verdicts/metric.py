@@ -6,17 +6,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import lm
-from epigauge.bundle.diagnosis import diagnosed
+from epigauge.bundle.diagnosis import Diagnosis, diagnosed
 from epigauge.bundle.problem import BundleState
 from epigauge.bundle.solve import BundleSystem
 from epigauge.cameras import AffineReconstruction, MetricReconstruction
 from epigauge.kernels import Table
 from epigauge.multi_view.frame import Frame
+from epigauge.multi_view.measured import whitened
 from epigauge.multi_view.tracks import Tracks
+from epigauge.multi_view.verdicts.distant import distance_flags, relative_depths
 from epigauge.multi_view.verdicts.front import BEHIND
+from epigauge.multi_view.verdicts.gross import gross_flags
+from epigauge.multi_view.verdicts.network import why_open
+from epigauge.multi_view.verdicts.perspective import affine_views
 from epigauge.multi_view.verdicts.relief import flatness
+from epigauge.multi_view.verdicts.shape import flat_scene, one_line
 from epigauge.multi_view.verdicts.verdict import Verdict
-from epigauge.multi_view.verdicts.words import largest, named
+from epigauge.multi_view.verdicts.words import largest, named, of_points, shares_of
+from epigauge.two_view.losses import median
 from epigauge.verdicts import ordered
 
 __all__ = ["judged_metric"]
@@ -27,6 +34,12 @@ Mask = NDArray[np.bool_]
 #: Standard deviation of the depth and image of a camera's points, as a share of their size, above
 #: which the noise leaves a change of the cameras open.
 _WEAK = 0.3
+
+#: Noise, as a share of the RMS of the image coordinates, up to which a fit is one.
+_FITS = 0.05
+
+#: Numbers of a camera before its intrinsics; part of an open direction that these must have.
+_POSE, _PART = 6, 0.05
 
 #: Share of its size that a metric quantity may be uncertain by before that is told.
 _UNCERTAIN = 0.1
@@ -40,6 +53,8 @@ def judged_metric(
     kernels: Table,
     known: Mask,
     fixes_gauge: bool,
+    predicted: Array,
+    bends: bool,
 ) -> Verdict:
     """Judge an adjusted metric or affine reconstruction.
 
@@ -59,6 +74,10 @@ def judged_metric(
         Points that are fixed.
     fixes_gauge : bool
         Whether anything fixed or known ties the reconstruction to its frame.
+    predicted : ndarray, shape (N, 2)
+        Where the points are projected to.
+    bends : bool
+        Whether the loss lets few observations bend the result: least squares.
 
     Returns
     -------
@@ -68,21 +87,79 @@ def judged_metric(
     """
     metric = depths is not None
     n_behind = 0 if depths is None else int(np.count_nonzero(~(depths > 0.0)))
-    raised = ["behind the cameras"] if n_behind > BEHIND * len(tracks) else []
+    raised = {"behind the cameras"} if n_behind > BEHIND * len(tracks) else set()
     system, rank = outcome.system, 0
     condition, weakest = float("inf"), ""
     if isinstance(system, BundleSystem) and np.isfinite(outcome.state.cost):
         diagnosis = diagnosed(system, kernels, known, fixes_gauge)
         rank, condition = diagnosis.rank, diagnosis.condition
-        counted = 2 * int(np.count_nonzero(tracks.weights)) - rank
-        noise_px = np.sqrt(2.0 * outcome.state.cost / max(counted, 1))
-        deviations = noise_px * np.abs(diagnosis.cameras)
-        weakest, share = named(system, deviations)
+        counts = tracks.weights > 0.0
+        share_free = max(1.0 - rank / max(2 * int(np.count_nonzero(counts)), 1), 1e-3)
+        r = whitened(tracks.whitening, (tracks.xy - predicted).T)
+        distances = (np.sqrt(tracks.weights) * np.linalg.norm(r, axis=0))[counts]
+        # Of two normal coordinates, the median distance is 1.1774 standard deviations.
+        usual = median(distances) / 1.1774 / float(np.sqrt(share_free))
+        if bends:
+            raised.update(gross_flags(distances, usual, tracks.xy[counts]))
+        noise_px = float(np.sqrt(np.sum(distances**2) / share_free / max(2 * len(distances), 1)))
+        # Affine cameras are computed with in other units of the image.
+        noise = noise_px if metric else noise_px / Frame.of(tracks).scale
+        weakest = named(system, shares_of(system, noise * np.abs(diagnosis.cameras)))
+        shares = shares_of(system, noise * diagnosis.spread)
         if diagnosis.open is not None:
             weakest = f"{largest(system, np.abs(diagnosis.open))} (undetermined)"
-        flat = 0.0 if metric else flatness(found, noise_px * Frame.of(tracks).scale)
-        if diagnosis.missing or flat > 1.0:
-            raised.append("undetermined")
-        elif flat > _WEAK or share > _UNCERTAIN:
-            raised.append("weak geometry")
+        group = of_points(diagnosis.points)
+        weakest += f"; {group}" if group else ""
+        flat = 0.0 if metric else flatness(found, noise_px)
+        worst = float(shares.max(initial=0.0))
+        if diagnosis.missing or flat > 1.0 or worst > 1.0:
+            raised.update(("undetermined", *why_open(tracks, tracks.weights <= 0.0)))
+        elif flat > _WEAK or worst > _UNCERTAIN:
+            raised.add("weak geometry")
+        # Where the fit is bad, nothing is within its noise.
+        if isinstance(found, MetricReconstruction) and usual < _FITS * Frame.of(tracks).scale:
+            told = worst > _UNCERTAIN
+            raised.update(_causes(tracks, found, predicted, system, diagnosis, usual, told, known))
     return Verdict(ordered(raised), rank, n_behind, condition, weakest)
+
+
+def _causes(
+    tracks: Tracks,
+    found: MetricReconstruction,
+    predicted: Array,
+    system: BundleSystem,
+    diagnosis: Diagnosis,
+    noise_px: float,
+    weak: bool,
+    known: Mask,
+) -> tuple[str, ...]:
+    """Return what makes calibrated cameras weak, by name."""
+    least = 1e-9 * Frame.of(tracks).scale
+    noise_px = max(noise_px, least)
+    free = system.ties.n_shared > 0 or _refines(system)
+    depths = relative_depths(system, noise_px, ~known)
+    raised = list(distance_flags(tracks, found, depths, noise_px))
+    counts = tracks.weights > 0.0
+    shares = shares_of(system, noise_px * diagnosis.spread)[:, _POSE:]
+    opened = shares.max(initial=0.0) > _UNCERTAIN
+    if diagnosis.open is not None:
+        size = np.abs(diagnosis.open)
+        opened = opened or size[:, _POSE:].max(initial=0.0) > _PART * size.max()
+    if opened:
+        raised.append("open intrinsics")
+    if free and flat_scene(system, noise_px):
+        raised.append("flat scene")
+    if affine_views(
+        tracks.view[counts], found.X[tracks.point[counts]], predicted[counts], noise_px
+    ):
+        raised.append("near-affine")
+    if (weak or diagnosis.missing or diagnosis.gauge == 1) and one_line(found.centres):
+        raised.append("collinear centres")
+    return tuple(raised)
+
+
+def _refines(system: BundleSystem) -> bool:
+    """Tell whether intrinsics of single views are refined."""
+    A = system.ties.A
+    more = system.normal.g_cameras.shape[1] > _POSE
+    return bool(more if A is None else A[:, _POSE:].any())

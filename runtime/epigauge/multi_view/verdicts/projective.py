@@ -19,9 +19,12 @@ from epigauge.multi_view.verdicts.counting import (
     missing_by_count,
 )
 from epigauge.multi_view.verdicts.front import BEHIND, behind
-from epigauge.multi_view.verdicts.gross import has_gross_errors
+from epigauge.multi_view.verdicts.gross import gross_flags
+from epigauge.multi_view.verdicts.network import why_open
+from epigauge.multi_view.verdicts.perspective import affine_pairs
 from epigauge.multi_view.verdicts.rank import open_directions, suits
 from epigauge.multi_view.verdicts.verdict import Verdict
+from epigauge.multi_view.verdicts.words import of_views
 from epigauge.two_view.losses import robust_scale
 from epigauge.verdicts import ordered
 
@@ -89,7 +92,7 @@ def judged(
     frame = Frame.of(tracks)
     if len(seen.view) < len(tracks) or not (isinstance(system, BundleSystem) and suits(system)):
         system = None
-    of_cameras, of_points, weakest = open_directions(seen, frame, kernels, workers, system)
+    of_cameras, of_points, weakest, parts = open_directions(seen, frame, kernels, workers, system)
     of_cameras = max(missing_by_count(seen), of_cameras) + CAMERA * lost
     views, points = (len(part) for part in fixed or ((), ()))
     if fixed is not None:
@@ -107,13 +110,18 @@ def judged(
     fits = noise_px < _FITS * frame.scale
     judge = fits and views < len(found.P)
     raised = set(parallax_flags(seen, noise_px)) if judge else set()
-    if bends and has_gross_errors(distances, noise_px, seen.xy):
-        raised.add("gross errors")
+    images = h[:, :2] / h[:, 2:]
+    if judge and not raised and affine_pairs(seen, images, noise_px):
+        raised.add("near-affine")
+    if bends:
+        raised.update(gross_flags(distances, noise_px, seen.xy))
     if of_cameras or of_points > _OPEN * seen.m:
-        raised.add("undetermined")
+        raised.update(("undetermined", *why_open(tracks, rejected)))
     elif of_points or deviation > _WEAK:
         raised.add("weak geometry")
     if n_behind > BEHIND * N:
         raised.add("behind the cameras")
     condition = float("inf") if of_cameras or not weakest > 0.0 else 1.0 / weakest
-    return Verdict(ordered(raised), full - of_cameras - of_points, n_behind, condition)
+    rank = full - of_cameras - of_points
+    words = of_views(parts, seen.views) + (" (undetermined)" if of_cameras else "")
+    return Verdict(ordered(raised), rank, n_behind, condition, words)

@@ -48,10 +48,11 @@ def suits(system: BundleSystem) -> bool:
 
 def open_directions(
     seen: Seen, frame: Frame, kernels: Table, workers: int, system: BundleSystem | None
-) -> tuple[int, int, float]:
+) -> tuple[int, int, float, Array]:
     """Return how many directions beside the gauge N leaves open, and its least other eigenvalue.
 
-    Those of the cameras, and those of single points, which spoil nothing else.
+    Those of the cameras, and those of single points, which spoil nothing else. Last, what part of
+    the weakest direction each camera has, (n,).
 
     In parameters in which W of the covariant damping is one, for which the basis does not matter.
     """
@@ -61,8 +62,8 @@ def open_directions(
             system = system or _normal_equations(seen, frame, kernels, workers)
             found = _measured(system, kernels)
     except np.linalg.LinAlgError:
-        return 1, 0, 0.0
-    return found if np.isfinite(found[2]) else (1, 0, 0.0)
+        return 1, 0, 0.0, np.zeros(seen.n)
+    return found if np.isfinite(found[2]) else (1, 0, 0.0, np.zeros(seen.n))
 
 
 def _normal_equations(seen: Seen, frame: Frame, kernels: Table, workers: int) -> BundleSystem:
@@ -76,7 +77,7 @@ def _normal_equations(seen: Seen, frame: Frame, kernels: Table, workers: int) ->
     return problem.linearize(BundleState(Estimate(P.reshape(-1, 12), Q), 0.0))
 
 
-def _measured(system: BundleSystem, kernels: Table) -> tuple[int, int, float]:
+def _measured(system: BundleSystem, kernels: Table) -> tuple[int, int, float, Array]:
     W = Covariant().blocks(system)
     # A point whose lines of sight are one leaves W singular, too.
     lifted = [
@@ -97,7 +98,9 @@ def _measured(system: BundleSystem, kernels: Table) -> tuple[int, int, float]:
         S = -(np.swapaxes(whitening[0], 1, 2)[:, None] @ less @ whitening[0])
         S[np.arange(n), np.arange(n)] += U
         dense = S.transpose(0, 2, 1, 3).reshape(n * a, n * a)
-        values = np.linalg.eigvalsh(dense + moves @ moves.T)
+        dense += moves @ moves.T
+        values = np.linalg.eigvalsh(dense)
+        weakest = _direction(dense, float(values[0]))
     else:
         shift = _SHIFT if coupling.direct else _SHIFT_ITERATIVE
         shifted, _ = reduced_system(
@@ -105,12 +108,23 @@ def _measured(system: BundleSystem, kernels: Table) -> tuple[int, int, float]:
         )
         columns = _COLUMNS if coupling.direct else 2
         while True:
-            values = _least(shifted, shift, moves, columns)
+            values, weakest = _least(shifted, shift, moves, columns)
             if columns >= n * a // 2 or not coupling.direct or values[-1] > _ROUNDING:
                 break
             columns *= 4
     open_cameras = int(np.count_nonzero(values <= _ROUNDING))
-    return open_cameras, open_points, float(max(values[0], 0.0))
+    parts = np.sum(weakest.reshape(n, a) ** 2, axis=1)
+    return open_cameras, open_points, float(max(values[0], 0.0)), parts / np.sum(parts)
+
+
+def _direction(S: Array, value: float) -> Array:
+    """Return the eigenvector of an eigenvalue that is known: two inverse iterations."""
+    shifted = S - (value - 1e-9 * np.trace(S) / len(S)) * np.eye(len(S))
+    found = np.random.default_rng(0).standard_normal((len(S), 1))
+    for _ in range(2):
+        found = np.linalg.solve(shifted, found)
+        found /= np.linalg.norm(found)
+    return np.asarray(found[:, 0])
 
 
 def _freedom(
@@ -130,8 +144,13 @@ def _freedom(
     return p, q, np.asarray(moves)
 
 
-def _least(shifted: Bordered | Iterated, shift: float, moves: Array, columns: int) -> Array:
-    """Return the least eigenvalues of S beside the gauge, from above: inverse iterations."""
+def _least(
+    shifted: Bordered | Iterated, shift: float, moves: Array, columns: int
+) -> tuple[Array, Array]:
+    """Return the least eigenvalues of S beside the gauge, from above: inverse iterations.
+
+    And the direction of the first.
+    """
     size = len(moves)
     X = np.random.default_rng(0).standard_normal((size, columns))
     for _ in range(_ITERATIONS):
@@ -140,9 +159,9 @@ def _least(shifted: Bordered | Iterated, shift: float, moves: Array, columns: in
         Y = Y.reshape(size, columns)
         Y -= moves @ (moves.T @ Y)
         # X^T S^-1 X has the inverse eigenvalues: Ritz values without a product with S.
-        inverse = np.linalg.eigvalsh(0.5 * (X.T @ Y + Y.T @ X))[::-1]
-        X = Y
-    return np.asarray(1.0 / np.maximum(inverse, 1e-300) - shift)
+        inverse, turn = np.linalg.eigh(0.5 * (X.T @ Y + Y.T @ X))
+        first, X = X @ turn[:, -1], Y
+    return 1.0 / np.maximum(inverse[::-1], 1e-300) - shift, first
 
 
 def _grounded(V: Array) -> tuple[int, Array]:

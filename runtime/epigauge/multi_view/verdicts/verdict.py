@@ -21,7 +21,7 @@ class Verdict:
     n_behind : int
         Observations of points behind the camera, signs of cameras and points being chosen best.
     condition, weakest : float, str
-        Of metric cameras: see `BundleResult`.
+        See `BundleResult`.
     """
 
     flags: tuple[str, ...]

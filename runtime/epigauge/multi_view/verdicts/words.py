@@ -7,9 +7,12 @@ from numpy.typing import NDArray
 
 from epigauge.bundle.solve import BundleSystem
 
-__all__ = ["largest", "named"]
+__all__ = ["largest", "named", "of_points", "of_views", "shares_of"]
 
 Array = NDArray[np.float64]
+
+#: Share of the squared motion that a group of points has, and largest share of them it may be.
+_NEARLY, _GROUP = 0.95, 0.5
 
 
 def largest(system: BundleSystem, sizes: Array) -> str:
@@ -19,24 +22,48 @@ def largest(system: BundleSystem, sizes: Array) -> str:
     return ", ".join(f"{names[k]} of view {i}" for i, k in zip(views, entries, strict=True))
 
 
-def named(system: BundleSystem, deviations: Array) -> tuple[str, float]:
-    """Return the largest standard deviations of a direction by name, as shares of their sizes.
+def shares_of(system: BundleSystem, deviations: Array) -> Array:
+    """Return standard deviations of own tangents (n, d) as shares of their sizes.
 
     Turns are in radians, moves as shares of the median distance of the points, focal lengths and
     other parameters in their unit as shares of the focal length; all others count for nothing.
     Affine cameras are as they are computed with: points of unit covariance, images of RMS one.
     """
-    model = system.model
     sizes = np.ones(deviations.shape)
-    if model.metric:
+    if system.model.metric:
         _set_sizes(sizes, system)
-    shares = deviations / sizes
+    return np.asarray(deviations / sizes)
+
+
+def named(system: BundleSystem, shares: Array) -> str:
+    """Return the three largest of `shares_of` by name."""
     views, entries = np.unravel_index(np.argsort(-shares, axis=None)[:3], shares.shape)
-    told = [
-        f"{model.tangent_names[k]} of view {i} ({100.0 * shares[i, k]:.2g} %)"
+    return ", ".join(
+        f"{system.model.tangent_names[k]} of view {i} ({100.0 * shares[i, k]:.2g} %)"
         for i, k in zip(views, entries, strict=True)
-    ]
-    return ", ".join(told), float(shares.max())
+    )
+
+
+def of_views(parts: Array, views: NDArray[np.intp]) -> str:
+    """Return which cameras have most part (n,) in a direction, by their numbers."""
+    if not parts.any():
+        return ""
+    first = np.argsort(-parts, kind="stable")[:3]
+    told = ", ".join(f"{views[k]} ({100.0 * parts[k]:.0f} %)" for k in first if parts[k] > 0.01)
+    return f"cameras of views {told}"
+
+
+def of_points(motion: Array) -> str:
+    """Return the group of points that has nearly all of a motion (m, b), or nothing."""
+    squares = np.sum(motion**2, axis=1)
+    order = np.argsort(-squares, kind="stable")
+    if not 0.0 < squares.sum() < np.inf:
+        return ""
+    count = 1 + int(np.searchsorted(np.cumsum(squares[order]), _NEARLY * squares.sum()))
+    if count > _GROUP * len(motion):
+        return ""
+    listed = ", ".join(map(str, sorted(order[: min(count, 5)].tolist())))
+    return f"points {listed}{' ...' if count > 5 else ''} ({count} of {len(motion)})"
 
 
 def _set_sizes(sizes: Array, system: BundleSystem) -> None:

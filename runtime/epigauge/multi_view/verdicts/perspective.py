@@ -1,0 +1,76 @@
+"""Whether perspective shows: else an affine model explains the images."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.multi_view.parallax import partners
+from epigauge.multi_view.seen import Seen
+
+__all__ = ["affine_pairs", "affine_views"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: Points that a view, or a pair of views, needs to be asked.
+_LEAST = 8
+
+
+def affine_views(view: Indices, X: Array, images: Array, noise_px: float) -> bool:
+    """Tell whether each view's images are an affine function of the points, within the noise.
+
+    Parameters
+    ----------
+    view : ndarray of int, shape (N,)
+        View of each observation.
+    X, images : ndarray, shape (N, 3), (N, 2)
+        Its point, and where the camera projects it to.
+    noise_px : float
+        Standard deviation of a coordinate.
+    """
+    counts = np.bincount(view)
+    asked = 0
+    # The first that shows perspective ends it: those with the most points are asked first.
+    for i in np.argsort(-counts, kind="stable"):
+        if counts[i] < _LEAST:
+            break
+        rows = np.flatnonzero(view == i)
+        if not np.isfinite(images[rows]).all():
+            return False
+        a = X[rows] - X[rows].mean(axis=0)
+        a = np.column_stack([a / max(float(np.abs(a).max()), 1e-300), np.ones(len(rows))])
+        off = images[rows] - a @ np.linalg.lstsq(a, images[rows], rcond=None)[0]
+        if float(np.mean(off**2)) > noise_px**2:
+            return False
+        asked += 1
+    return asked > 0
+
+
+def affine_pairs(seen: Seen, images: Array, noise_px: float) -> bool:
+    """Tell whether an affine epipolar geometry holds for pairs of views, within the noise.
+
+    Parameters
+    ----------
+    seen : Seen
+        The observations that count.
+    images : ndarray, shape (N, 2)
+        Where the cameras project the points to.
+    noise_px : float
+        Standard deviation of a coordinate.
+    """
+    begin = np.searchsorted(seen.point, np.arange(seen.m + 1))
+    asked = 0
+    for i in np.unique(np.linspace(0, seen.n - 1, min(seen.n, 10)).astype(np.intp)):
+        for k in partners(seen, begin, int(i)):
+            rows = np.full((2, seen.m), -1)
+            for side, one in enumerate((i, k)):
+                own = np.flatnonzero(seen.view == one)
+                rows[side, seen.point[own]] = own
+            both = rows[:, (rows >= 0).all(axis=0)]
+            four = np.column_stack([images[both[0]], images[both[1]]])
+            least = np.linalg.svd(four - four.mean(axis=0), compute_uv=False)[-1]
+            if least > noise_px * np.sqrt(len(four)):
+                return False
+            asked += 1
+    return asked > 0

@@ -1,0 +1,38 @@
+"""Scenes and networks that leave intrinsics weak: flat ones, and centres on one line."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.bundle.solve import BundleSystem
+
+__all__ = ["flat_scene", "one_line"]
+
+Array = NDArray[np.float64]
+
+#: Thickness of a flat scene, in standard deviations of the points across it, and over its extent.
+_THICK, _THIN = 3.0, 1e-6
+
+#: Largest distance of centres from their line, over their extent along it.
+_LINE = 0.01
+
+
+def flat_scene(system: BundleSystem, noise_px: float) -> bool:
+    """Tell whether all points lie in one plane, within what the noise makes of them."""
+    X = system.points - system.points.mean(axis=0)
+    _, values, axes = np.linalg.svd(X, full_matrices=False)
+    V = system.normal.V
+    size = np.maximum(np.einsum("mii->m", V), 1e-300)[:, None, None]
+    across = np.linalg.solve(V + 1e-14 * size * np.eye(3), axes[2][:, None])[..., 0] @ axes[2]
+    noise = noise_px * np.sqrt(np.median(np.maximum(across, 0.0)))
+    thickness = values[2] / np.sqrt(len(X))
+    return bool(thickness <= max(_THICK * noise, _THIN * values[0] / np.sqrt(len(X))))
+
+
+def one_line(centres: Array) -> bool:
+    """Tell whether three or more centres of cameras are on one line."""
+    if len(centres) < 3:
+        return False
+    values = np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)
+    return bool(values[1] <= _LINE * values[0])
