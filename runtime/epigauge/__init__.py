@@ -89,6 +89,7 @@ __all__ = [
     "RotationPrior",
     "Tracks",
     "TwoViewScene",
+    "arrays",
     "backend",
     "bundle_adjust",
     "canonical_cameras",
@@ -159,7 +160,7 @@ _WHERE = {
     "uncertainty.covariance": "MetricCovariance",
 }
 _MODULES = {
-    **{name: name for name in ("casadi", "colmap", "datasets", "interop", "kernels")},
+    **{name: name for name in ("arrays", "casadi", "colmap", "datasets", "interop", "kernels")},
     **{name: name for name in ("errors", "images", "io", "lm", "plots", "reports", "scenes")},
     "verdicts": "verdicts",
     "gauge": "multi_view.gauge",

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
-from epigauge import kernels
+from epigauge import arrays, kernels
 from epigauge.kernels import SIGNATURES
 from epigauge_generated.signatures import MODELS
 from laws import distance, factor_cases, fundamental_cases, matches, orthonormal
@@ -152,6 +154,19 @@ def test_casadi_is_numpy(name):
     for seed, batch in enumerate(BATCHES):
         if legal(name, batch):
             compare(name, backend("casadi"), inputs(name, batch, seed), 1e-12)
+
+
+@pytest.mark.parametrize("name", SIGNATURES)
+def test_the_functions_over_array_namespaces_are_numpy(name):
+    # The same expressions in the same order: the same bits, but for the order of a sum.
+    namespace = pytest.importorskip("array_api_compat.numpy", reason="needs array-api-compat")
+    over = arrays.table(namespace)
+    tolerance = 1e-14 if name in SUMMED else 0.0
+    for seed, batch in enumerate(BATCHES[:4]):
+        if legal(name, batch):
+            with warnings.catch_warnings():  # scalars divide by zero with a warning of their own
+                warnings.simplefilter("ignore", RuntimeWarning)
+                compare(name, over, inputs(name, batch, seed), tolerance)
 
 
 @pytest.mark.parametrize("case", fundamental_cases())

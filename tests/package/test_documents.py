@@ -14,14 +14,26 @@ from _pytest.mark import ParameterSet
 from epigauge.datasets import DatasetError, _store
 from epigauge.errors import MissingPackageError
 
-OPTIONAL = ("cv2", "casadi", "matplotlib", "poselib", "pycolmap", "rich", "sympy", "typer")
+OPTIONAL = (
+    *("cv2", "casadi", "matplotlib", "poselib", "pycolmap", "rich", "sympy", "torch", "typer"),
+)
 #: Public modules beside the package itself, by the name that users write.
 MODULES = {
     "epigauge.gauge": eg.gauge,
     **{
         f"epigauge.{name}": importlib.import_module(f"epigauge.{name}")
         for name in (
-            *("casadi", "colmap", "datasets", "errors", "images", "interop", "io", "kernels"),
+            *(
+                "arrays",
+                "casadi",
+                "colmap",
+                "datasets",
+                "errors",
+                "images",
+                "interop",
+                "io",
+                "kernels",
+            ),
             *("plots", "reports", "verdicts"),
         )
     },

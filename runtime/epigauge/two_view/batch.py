@@ -11,24 +11,22 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epigauge import lm
+from epigauge import arrays, lm
 from epigauge._arguments import as_array, as_count, as_matches, as_real, as_weights
 from epigauge._logged import logged
 from epigauge._options import PairOptions, known_options
 from epigauge.errors import ArgumentError
-from epigauge.two_view import native, quick
+from epigauge.two_view import native, quick, tensors
 from epigauge.two_view._partial import Partial
 from epigauge.two_view.copies import counted_once
 from epigauge.two_view.express import completed
 from epigauge.two_view.refine import plan_of, refine_fundamental
 from epigauge.two_view.result import FundamentalResult
+from epigauge.two_view.tensors import REFUSED
 
 __all__ = ["BATCH_STATUS", "FundamentalBatch", "refine_fundamental_batch"]
 
 Array = NDArray[np.float64]
-
-#: Status of a pair that could not be refined, beside those of `epigauge.lm.STATUS`.
-REFUSED = -9
 
 #: Pairs that a thread refines at a time.
 _CHUNK = 64
@@ -121,7 +119,10 @@ def refine_fundamental_batch(
     Parameters
     ----------
     x1, x2 : array_like, shape (m, 2)
-        The matches of all pairs, one pair after the other, in pixels.
+        The matches of all pairs, one pair after the other, in pixels. Arrays of PyTorch, JAX, CuPy
+        and others of the array API standard are refined where they are, all pairs at once, by the
+        exact Newton loop only; the result then holds arrays of the same kind, through which
+        derivatives of F, cost and distances by x1 and x2 can be taken (extra ``array``).
     offsets : array_like of int, shape (n + 1,)
         Pair k has the matches ``offsets[k]:offsets[k + 1]``; from 0 to m.
     F0 : array_like, shape (n, 3, 3), optional
@@ -135,7 +136,9 @@ def refine_fundamental_batch(
     flags : bool
         Diagnose every pair at once, not when `flags` or `success` of the result is asked for.
     **options
-        All other options of `refine_fundamental`, the same for every pair.
+        All other options of `refine_fundamental`, the same for every pair;
+        ``backend="array"`` computes NumPy arrays as those of other libraries. Of these options
+        arrays of other libraries take `ftol`, `xtol`, `gtol` and `max_iter` only.
 
     Returns
     -------
@@ -149,6 +152,11 @@ def refine_fundamental_batch(
         On bad shapes, NaN or infinity, offsets that do not partition the matches, and unknown
         options.
     """
+    if arrays.is_tensor(x1) or options.get("backend") == "array":
+        found = _over_arrays(x1, x2, offsets, F0, weights, options)
+        if flags:
+            _ = found.flags  # computed when asked for
+        return found
     x1, x2 = as_matches(x1, x2, at_least=0)
     bounds = _as_offsets(offsets, len(x1))
     count = len(bounds) - 1
@@ -194,6 +202,31 @@ def _check_options(options: dict[str, Any]) -> None:
     options = {name: value for name, value in options.items() if name != "callback"}
     grid = np.stack(np.meshgrid([0.0, 1.0, 2.5], [0.0, 1.0, 3.0]), axis=-1).reshape(-1, 2)
     refine_fundamental(grid, grid @ [[1.0, 0.2], [0.1, 1.1]] + grid**2, **options)
+
+
+def _over_arrays(
+    x1: Any, x2: Any, offsets: ArrayLike, F0: Any, weights: Any, options: dict[str, Any]
+) -> FundamentalBatch:
+    """Refine over the namespace of the matches; what is costly is computed by NumPy when asked."""
+    if not arrays.is_tensor(x1):
+        x1, x2 = as_matches(x1, x2, at_least=0)
+    host1, host2 = as_matches(arrays.host(x1), arrays.host(x2), at_least=0)
+    bounds = _as_offsets(offsets, len(host1))
+    known = tensors.refined(x1, x2, (host1, host2), bounds, F0, weights, options)
+    convert = tensors.like(x1)
+
+    def rest() -> SimpleNamespace:
+        starts = arrays.host(known["F"])
+        refused = list(known["reasons"])
+        starts[refused] = np.eye(3)
+        given = None if weights is None else arrays.host(weights)
+        found = refine_fundamental_batch(host1, host2, bounds, starts, weights=given)
+        names = ("noise_px", "condition", "covariance")
+        values = {name: convert(getattr(found, name)) for name in names}
+        success = found.success & (known["status"] > 0)
+        return SimpleNamespace(**values, rank=found.rank, flags=found.flags, success=success)
+
+    return FundamentalBatch.partial(known, rest)
 
 
 class _Work:
