@@ -107,8 +107,13 @@ int eg_bundle_eliminate(
 
 EG_EXPORT int eg_bundle_couple(
     const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras,
-    const double *points, const double *T, const double *x, const double *y, double *moved,
-    double *reduced);
+    const double *points, const double *T, ptrdiff_t count, const double *x, const double *y,
+    double *moved, double *reduced);
+
+EG_EXPORT int eg_bundle_marginals(
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras,
+    const double *points, const double *T, const double *X, const eg_envelope *envelope,
+    double *marginals, const ptrdiff_t *first, double *coupled);
 
 /* ---------------------------------------------------------------- bundle_reduced.c */
 

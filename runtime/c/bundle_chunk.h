@@ -8,15 +8,6 @@
 #include "bundle.h"
 #include "losses.h"
 
-/* Inlined wherever it is called: its sizes and functions are constants there. */
-#if defined(_MSC_VER)
-#define EG_INLINE static __forceinline
-#elif defined(__GNUC__)
-#define EG_INLINE static inline __attribute__((always_inline))
-#else
-#define EG_INLINE static inline
-#endif
-
 typedef struct {
     ptrdiff_t M, L;
     const int32_t *point, *count, *view;
@@ -66,10 +57,15 @@ struct eg_route {
     /* Evaluate a slot for `turn`, and for `observe`, which adds to the sums of points and cameras. */
     void (*evaluate)(eg_pass *);
     void (*observe)(eg_pass *, double *sums, double *cameras);
+    /* Evaluate a slot for the next two, which work on one of `count` columns: entries are `count` rows
+       of lanes apart. */
+    void (*couple)(const eg_pass *, const double *roots);
     /* v += (W T)^T x for x of the cameras, (tangent, M). */
-    void (*to_points)(const eg_pass *, const double *roots, const double *x, double *v);
+    void (*to_points)(const eg_pass *, const double *roots, ptrdiff_t count, const double *x,
+                      double *v);
     /* cameras += W T v. */
-    void (*to_cameras)(const eg_pass *, const double *roots, const double *v, double *cameras);
+    void (*to_cameras)(const eg_pass *, const double *roots, ptrdiff_t count, const double *v,
+                       double *cameras);
     /* Turn the factors W T of a chunk, what is kept of its first slot being at `kept`, into those of a
        group, behind what it has; cameras += W T v unless v is NULL. May add pairs on its own, and
        leave the group as it is. */
@@ -78,6 +74,11 @@ struct eg_route {
     /* Add W T T^T W^T of all pairs of observations of each point of a group to their pairs of
        views. */
     void (*pairs)(const eg_route *, const eg_envelope *, eg_group *, double *pairs);
+    /* Of the direct route: the sum Z (b, b) of Y_s^T X_st Y_t over all pairs of observations of a
+       lane of a group, Y = W T; unless NULL, `coupled` gets the sums of X_st Y_t over t, b rows of the
+       padded width an observation. X is of pairs of views, stored as their sums. */
+    void (*marginal)(const eg_route *, const eg_envelope *, const eg_group *, ptrdiff_t lane,
+                     const double *X, double *Z, double *coupled);
     /* Of the direct route, for its width of rows: turn Jacobians J of a slot, lane by lane; add them
        and residuals r to the sums of cameras; turn those of slot s, lanes beginning at `first` in the
        group. */

@@ -66,30 +66,30 @@ static void observe(eg_pass *p, double *sums, double *cameras)
     p->route->add_cameras(p, p->work, cameras);
 }
 
-/* The Jacobians of the camera (2, tangent of the model) and of the point (2, b), and weights. */
-static const double *jacobians(const eg_pass *p)
+/* In work: residuals, J_point (2, b), J_camera (2, tangent of the model). */
+static void couple(const eg_pass *p, const double *roots)
 {
+    (void)roots;
     const ptrdiff_t M = p->chunk.M;
     double *r = p->work, *J = r + 2 * M, *J_camera = J + 2 * p->route->point * M;
     eg_model_of(p)->observe(M, p->cameras, p->points, p->q, r, J_camera, J);
     if (p->bundle->loss != EG_LINEAR)
         square(p, r);
     eg_weigh(p);
-    return J_camera;
 }
 
-static void to_points(const eg_pass *p, const double *roots, const double *x, double *v)
+static void to_points(const eg_pass *p, const double *roots, ptrdiff_t count, const double *x,
+                      double *v)
 {
     const ptrdiff_t M = p->chunk.M, b = p->route->point, K = p->route->tangent;
-    const ptrdiff_t d = eg_model_of(p)->tangent_size;
-    const double *J_camera = jacobians(p), *EG_RESTRICT w = p->w;
-    const double *J = p->work + 2 * M;
+    const ptrdiff_t d = eg_model_of(p)->tangent_size, step = count * M;
+    const double *J = p->work + 2 * M, *J_camera = J + 2 * b * M, *EG_RESTRICT w = p->w;
     /* u = w J_camera x in the place of the residuals */
     double *EG_RESTRICT u = p->work, *EG_RESTRICT t = p->work + M;
     memset(u, 0, (size_t)(2 * M) * sizeof(double));
     for (ptrdiff_t k = 0; k < K; ++k) {
         const double *EG_RESTRICT first = J_camera + p->bundle->columns[k] * M;
-        const double *EG_RESTRICT second = first + d * M, *EG_RESTRICT own = x + k * M;
+        const double *EG_RESTRICT second = first + d * M, *EG_RESTRICT own = x + k * step;
         EG_SIMD
         for (ptrdiff_t j = 0; j < M; ++j)
             u[j] += first[j] * own[j], t[j] += second[j] * own[j];
@@ -102,7 +102,7 @@ static void to_points(const eg_pass *p, const double *roots, const double *x, do
             z[j] = w[j] * (first[j] * u[j] + second[j] * t[j]);
         for (ptrdiff_t k = 0; k < b; ++k) { /* all of T: a change of parameters is full */
             const double *EG_RESTRICT T = roots + (b * l + k) * M;
-            double *EG_RESTRICT sum = v + k * M;
+            double *EG_RESTRICT sum = v + k * step;
             EG_SIMD
             for (ptrdiff_t j = 0; j < M; ++j)
                 sum[j] += T[j] * z[j];
@@ -110,25 +110,26 @@ static void to_points(const eg_pass *p, const double *roots, const double *x, do
     }
 }
 
-static void to_cameras(const eg_pass *p, const double *roots, const double *v, double *cameras)
+static void to_cameras(const eg_pass *p, const double *roots, ptrdiff_t count, const double *v,
+                       double *cameras)
 {
     const ptrdiff_t M = p->chunk.M, b = p->route->point, K = p->route->tangent;
     const ptrdiff_t d = eg_model_of(p)->tangent_size;
-    const double *J_camera = jacobians(p), *J = p->work + 2 * M;
+    const double *J = p->work + 2 * M, *J_camera = J + 2 * b * M;
     for (ptrdiff_t j = 0; j < p->filled; ++j) {
-        double *EG_RESTRICT camera = cameras + K * p->view[j];
+        double *EG_RESTRICT camera = cameras + count * K * p->view[j];
         double x = 0.0, y = 0.0;
         for (ptrdiff_t l = 0; l < b; ++l) {
             double moved = 0.0; /* (T v)_l */
             for (ptrdiff_t k = 0; k < b; ++k)
-                moved += roots[(b * l + k) * M + j] * v[k * M + j];
+                moved += roots[(b * l + k) * M + j] * v[count * k * M + j];
             x += J[l * M + j] * moved;
             y += J[(b + l) * M + j] * moved;
         }
         x *= p->w[j], y *= p->w[j];
         for (ptrdiff_t k = 0; k < K; ++k) {
             const double *entry = J_camera + p->bundle->columns[k] * M + j;
-            camera[k] += entry[0] * x + entry[d * M] * y;
+            camera[count * k] += entry[0] * x + entry[d * M] * y;
         }
     }
 }
@@ -193,10 +194,12 @@ eg_route eg_direct_route(const eg_bundle *bundle)
         .sight = sight,
         .evaluate = evaluate,
         .observe = observe,
+        .couple = couple,
         .to_points = to_points,
         .to_cameras = to_cameras,
         .turn = turn,
     };
     eg_direct_loops(&route);
+    eg_direct_marginal(&route);
     return route;
 }

@@ -48,58 +48,78 @@ static void evaluate(eg_pass *p)
     eg_weigh(p);
 }
 
-/* F = w a^T a P T, (3, 4). */
-static void couple(const eg_pass *p, const double *roots, double *F)
+/* F = w a^T a P T, (3, 4), behind ten rows of scratch. */
+static void couple(const eg_pass *p, const double *roots)
 {
     if (p->bundle->loss != EG_LINEAR)
         squared(p);
     eg_weigh(p);
-    eg_coupling(p->chunk.M, p->cameras, p->points, p->w, roots, F);
+    eg_coupling(p->chunk.M, p->cameras, p->points, p->w, roots, p->work + 10 * p->chunk.M);
 }
 
-static void to_points(const eg_pass *p, const double *roots, const double *x, double *v)
+static void to_points(const eg_pass *p, const double *roots, ptrdiff_t count, const double *x,
+                      double *v)
 {
-    const ptrdiff_t M = p->chunk.M;
-    const double *Q = p->points;
-    double *moved = p->work, *F = moved + 10 * M;
-    couple(p, roots, F);
+    (void)roots;
+    const ptrdiff_t M = p->chunk.M, step = count * M;
+    const double *Q = p->points, *F = p->work + 10 * M;
+    double *moved = p->work;
     for (int a = 0; a < 3; ++a) {
+        const double *own = x + 4 * a * step;
         EG_SIMD
         for (ptrdiff_t j = 0; j < M; ++j)
-            moved[a * M + j] = x[(4 * a) * M + j] * Q[j] + x[(4 * a + 1) * M + j] * Q[M + j]
-                               + x[(4 * a + 2) * M + j] * Q[2 * M + j]
-                               + x[(4 * a + 3) * M + j] * Q[3 * M + j];
+            moved[a * M + j] = own[j] * Q[j] + own[step + j] * Q[M + j]
+                               + own[2 * step + j] * Q[2 * M + j]
+                               + own[3 * step + j] * Q[3 * M + j];
     }
     for (int k = 0; k < 4; ++k) {
         EG_SIMD
         for (ptrdiff_t j = 0; j < M; ++j)
-            v[k * M + j] += F[k * M + j] * moved[j] + F[(4 + k) * M + j] * moved[M + j]
-                            + F[(8 + k) * M + j] * moved[2 * M + j];
+            v[k * step + j] += F[k * M + j] * moved[j] + F[(4 + k) * M + j] * moved[M + j]
+                               + F[(8 + k) * M + j] * moved[2 * M + j];
     }
 }
 
-static void add_to_cameras(const eg_pass *p, const double *F, const double *v, double *cameras)
+/* F v, (3, M), in scratch. */
+static const double *moved_by(const eg_pass *p, const double *F, ptrdiff_t step, const double *v)
 {
     const ptrdiff_t M = p->chunk.M;
     double *y = p->work;
     for (int a = 0; a < 3; ++a) {
         EG_SIMD
         for (ptrdiff_t j = 0; j < M; ++j)
-            y[a * M + j] = F[(4 * a) * M + j] * v[j] + F[(4 * a + 1) * M + j] * v[M + j]
-                           + F[(4 * a + 2) * M + j] * v[2 * M + j]
-                           + F[(4 * a + 3) * M + j] * v[3 * M + j];
+            y[a * M + j] = F[(4 * a) * M + j] * v[j] + F[(4 * a + 1) * M + j] * v[step + j]
+                           + F[(4 * a + 2) * M + j] * v[2 * step + j]
+                           + F[(4 * a + 3) * M + j] * v[3 * step + j];
     }
+    return y;
+}
+
+static void add_to_cameras(const eg_pass *p, const double *F, const double *v, double *cameras)
+{
+    const ptrdiff_t M = p->chunk.M;
+    const double *y = moved_by(p, F, M, v);
     for (ptrdiff_t j = 0, end; j < p->filled; j = end) {
         end = eg_run(p->view, j, p->filled);
         eg_accumulate_points(end - j, y + j, M, p->moments + 16 * j, cameras + 12 * p->view[j]);
     }
 }
 
-static void to_cameras(const eg_pass *p, const double *roots, const double *v, double *cameras)
+static void to_cameras(const eg_pass *p, const double *roots, ptrdiff_t count, const double *v,
+                       double *cameras)
 {
-    double *F = p->work + 10 * p->chunk.M;
-    couple(p, roots, F);
-    add_to_cameras(p, F, v, cameras);
+    (void)roots;
+    const ptrdiff_t M = p->chunk.M;
+    const double *F = p->work + 10 * M;
+    if (count == 1) {
+        add_to_cameras(p, F, v, cameras);
+        return;
+    }
+    const double *y = moved_by(p, F, count * M, v);
+    for (ptrdiff_t j = 0; j < p->filled; ++j)
+        for (int a = 0; a < 3; ++a)
+            for (int k = 0; k < 4; ++k)
+                cameras[count * (12 * p->view[j] + 4 * a + k)] += y[a * M + j] * p->points[k * M + j];
 }
 
 /* Lanes that hold a point, where all of these are seen by the same views, once; else 0. */
@@ -166,6 +186,7 @@ const eg_route eg_factored_route = {
     .sight = sight,
     .evaluate = evaluate,
     .observe = observe,
+    .couple = couple,
     .to_points = to_points,
     .to_cameras = to_cameras,
     .turn = turn,

@@ -39,16 +39,24 @@ static inline ptrdiff_t eg_group_end(const eg_bundle *b, ptrdiff_t begin, ptrdif
     return next;
 }
 
+/* The most lanes, and observations, of a group of some chunks. */
+static inline ptrdiff_t eg_group_most(const eg_bundle *b, const eg_route *route, ptrdiff_t begin,
+                                      ptrdiff_t end, const ptrdiff_t *edges)
+{
+    ptrdiff_t most = 0;
+    for (ptrdiff_t c = begin, next; c < end; c = next) {
+        next = eg_group_end(b, c, end, route->turned);
+        most = edges[next] - edges[c] > most ? edges[next] - edges[c] : most;
+    }
+    return most;
+}
+
 /* A group with room for the largest of some chunks; 1 where there is no memory. */
 static inline int eg_group_begin(eg_group *group, const eg_bundle *b, const eg_route *route,
                                  ptrdiff_t begin, ptrdiff_t end)
 {
-    ptrdiff_t rows = 0, lanes = 0;
-    for (ptrdiff_t c = begin, next; c < end; c = next) {
-        next = eg_group_end(b, c, end, route->turned);
-        rows = b->rows[next] - b->rows[c] > rows ? b->rows[next] - b->rows[c] : rows;
-        lanes = b->lanes[next] - b->lanes[c] > lanes ? b->lanes[next] - b->lanes[c] : lanes;
-    }
+    const ptrdiff_t rows = eg_group_most(b, route, begin, end, b->rows);
+    const ptrdiff_t lanes = eg_group_most(b, route, begin, end, b->lanes);
     const ptrdiff_t moments = route->factored ? 16 * lanes : 0;
     const ptrdiff_t whole = 3 * rows + lanes + 1 + b->n_views + 2;
     group->turned = eg_aligned(route->turned * rows + moments + (whole + 1) / 2);

@@ -286,7 +286,7 @@ static void couple_part(void *self, ptrdiff_t k)
 {
     state *s = self;
     const ptrdiff_t *edge = s->options->passes + k;
-    s->statuses[k] = eg_bundle_couple(s->bundle, edge[0], edge[1], s->cameras, s->points, s->T,
+    s->statuses[k] = eg_bundle_couple(s->bundle, edge[0], edge[1], s->cameras, s->points, s->T, 1,
                                       s->step, 0, s->coupled, 0);
 }
 

@@ -321,7 +321,7 @@ EG_INLINE void add_block(ptrdiff_t K, ptrdiff_t padded, ptrdiff_t b, ptrdiff_t r
         turn_direct(p, W, B, Z, v, first, s, group->turned, reduced);                              \
     }
 
-/* Those of a width, up to EG_MOST_TANGENT. */
+/* Those of a width. */
 #define WIDTH(W)                                                                                   \
     static void turn_cameras_##W(const eg_pass *p, const double *J)                                \
     {                                                                                              \
@@ -333,8 +333,7 @@ EG_INLINE void add_block(ptrdiff_t K, ptrdiff_t padded, ptrdiff_t b, ptrdiff_t r
     }                                                                                              \
     LOOPS(three_##W, W, 3) LOOPS(four_##W, W, 4)
 
-#define WIDTHS(CASE) CASE(8) CASE(12) CASE(16) CASE(20) CASE(24) CASE(32)
-WIDTHS(WIDTH)
+EG_WIDTHS(WIDTH)
 
 void eg_direct_loops(eg_route *route)
 {
@@ -347,7 +346,7 @@ void eg_direct_loops(eg_route *route)
         route->turn_slot = three ? turn_slot_three_##W : turn_slot_four_##W;                       \
         route->pairs = three ? pairs_three_##W : pairs_four_##W;                                   \
         break;
-        WIDTHS(CASE)
+        EG_WIDTHS(CASE)
 #undef CASE
     }
 }

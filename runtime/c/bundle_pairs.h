@@ -15,7 +15,12 @@ void eg_factored_pairs(const eg_route *, const eg_envelope *, eg_group *, double
 void eg_factored_pairs_alike(const eg_pass *, const eg_envelope *, ptrdiff_t lanes, const double *F,
                              double *pairs);
 
-/* Fill in `turn_cameras`, `add_cameras`, `turn_slot` and `pairs` of the direct route for its width. */
+/* Widths of rows, up to EG_MOST_TANGENT. */
+#define EG_WIDTHS(CASE) CASE(8) CASE(12) CASE(16) CASE(20) CASE(24) CASE(32)
+
+/* Fill in `turn_cameras`, `add_cameras`, `turn_slot` and `pairs` of the direct route for its width;
+   in bundle_marginals.c: `marginal`. */
 void eg_direct_loops(eg_route *route);
+void eg_direct_marginal(eg_route *route);
 
 #endif

@@ -141,40 +141,144 @@ int eg_bundle_eliminate(
 }
 
 /* v = y + T^T W^T x, with y = 0 or x = 0 where NULL; moved = v and reduced += W T v unless NULL.
-   T is the identity where NULL. */
+   T is the identity where NULL. All are `count` columns: x (n, tangent, count), y (m, b, count). */
 int eg_bundle_couple(
     const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras,
-    const double *points, const double *T, const double *x, const double *y, double *moved,
-    double *reduced)
+    const double *points, const double *T, ptrdiff_t count, const double *x, const double *y,
+    double *moved, double *reduced)
 {
     const eg_route route = eg_route_of(bundle);
     const ptrdiff_t b = route.point, a = route.tangent;
     eg_pass p;
-    if (eg_pass_begin(&p, bundle, &route, begin, end, a + b + b * b, 0))
+    if (eg_pass_begin(&p, bundle, &route, begin, end, (a + b) * count + b * b, 0))
         return 1;
     for (ptrdiff_t c = begin; c < end; ++c) {
         eg_pass_chunk(&p, c, points);
         const ptrdiff_t M = p.chunk.M;
-        double *v = p.extra, *roots = v + b * M, *gathered = roots + b * b * M;
+        double *v = p.extra, *roots = v + b * count * M, *gathered = roots + b * b * M;
         gather_roots(&p.chunk, b, T, roots);
         if (route.factored)
             eg_moments(M, p.points, p.moments);
         if (y)
-            eg_gather(M, b, y, p.chunk.point, v);
+            eg_gather(M, b * count, y, p.chunk.point, v);
         else
-            memset(v, 0, (size_t)(b * M) * sizeof(double));
+            memset(v, 0, (size_t)(b * count * M) * sizeof(double));
         for (ptrdiff_t s = 0; x && s < p.chunk.L; ++s) {
             eg_pass_slot(&p, s, cameras);
-            eg_gather(M, a, x, p.view, gathered);
-            route.to_points(&p, roots, gathered, v);
+            eg_gather(M, a * count, x, p.view, gathered);
+            route.couple(&p, roots);
+            for (ptrdiff_t k = 0; k < count; ++k)
+                route.to_points(&p, roots, count, gathered + k * M, v + k * M);
         }
         if (moved)
-            eg_scatter(&p.chunk, b, v, moved);
+            eg_scatter(&p.chunk, b * count, v, moved);
         for (ptrdiff_t s = 0; reduced && s < p.chunk.L; ++s) {
             eg_pass_slot(&p, s, cameras);
-            route.to_cameras(&p, roots, v, reduced);
+            route.couple(&p, roots);
+            for (ptrdiff_t k = 0; k < count; ++k)
+                route.to_cameras(&p, roots, count, v + k * M, reduced + k);
         }
     }
     eg_release(p.memory);
     return 0;
+}
+
+/* T (I + Z) T^T for the lanes of a chunk that hold a point, Z and T (b, b) an array of lanes. */
+static void around_roots(const eg_chunk *chunk, ptrdiff_t b, const double *roots, const double *Z,
+                         double *blocks)
+{
+    const ptrdiff_t M = chunk->M;
+    for (ptrdiff_t j = 0; j < M && chunk->count[j]; ++j, Z += b * b) {
+        double T[16], half[16], *block = blocks + b * b * chunk->point[j];
+        for (ptrdiff_t k = 0; k < b * b; ++k)
+            T[k] = roots[k * M + j];
+        for (ptrdiff_t i = 0; i < b; ++i)
+            for (ptrdiff_t k = 0; k < b; ++k) {
+                half[b * i + k] = T[b * i + k];
+                for (ptrdiff_t l = 0; l < b; ++l)
+                    half[b * i + k] += T[b * i + l] * 0.5 * (Z[b * l + k] + Z[b * k + l]);
+            }
+        for (ptrdiff_t i = 0; i < b; ++i)
+            for (ptrdiff_t k = 0; k <= i; ++k) {
+                double sum = 0.0;
+                for (ptrdiff_t l = 0; l < b; ++l)
+                    sum += half[b * i + l] * T[b * k + l];
+                block[b * i + k] = block[b * k + i] = sum;
+            }
+    }
+}
+
+/* -X Y T^T of the observations of a chunk's lanes that hold a point, in the order of the points:
+   (K, b) each, from b rows of the padded width. */
+static void across_roots(const eg_route *route, const eg_chunk *chunk, const double *roots,
+                         const ptrdiff_t *first, const double *coupled, double *blocks)
+{
+    const ptrdiff_t M = chunk->M, b = route->point, K = route->tangent;
+    for (ptrdiff_t j = 0; j < M && chunk->count[j]; ++j)
+        for (ptrdiff_t s = 0; s < chunk->count[j]; ++s, coupled += b * route->padded) {
+            double *block = blocks + K * b * (first[chunk->point[j]] + s);
+            for (ptrdiff_t i = 0; i < K; ++i)
+                for (ptrdiff_t k = 0; k < b; ++k) {
+                    double sum = 0.0;
+                    for (ptrdiff_t l = 0; l < b; ++l)
+                        sum += coupled[route->padded * l + i] * roots[(b * k + l) * M + j];
+                    block[b * i + k] = -sum;
+                }
+        }
+}
+
+/* The points' diagonal blocks of the whole inverse, T (I + Y^T X Y) T^T with Y = W T, from the
+   cameras' blocks X of all pairs of views that see common points, stored as sums of pairs. Unless
+   NULL, `coupled` gets the blocks (camera, point) of each observation, those of a point from
+   `first` on. Of the direct route. */
+int eg_bundle_marginals(
+    const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras,
+    const double *points, const double *T, const double *X, const eg_envelope *envelope,
+    double *marginals, const ptrdiff_t *first, double *coupled)
+{
+    elimination e;
+    eg_pass *p = &e.pass;
+    if (elimination_begin(&e, bundle, begin, end, 0))
+        return 1;
+    const ptrdiff_t b = e.route.point, size = b * e.route.padded;
+    const ptrdiff_t lanes = eg_group_most(bundle, &e.route, begin, end, bundle->lanes);
+    const ptrdiff_t rows = eg_group_most(bundle, &e.route, begin, end, bundle->rows);
+    double *Z = eg_aligned(b * b * lanes + (coupled ? size * rows : 0));
+    for (ptrdiff_t c = begin, last; Z && c < end; c = last) {
+        eg_group_clear(&e.group);
+        last = eg_group_end(bundle, c, end, e.route.turned);
+        for (ptrdiff_t k = c; k < last; ++k) {
+            eg_pass_chunk(p, k, points);
+            const ptrdiff_t M = p->chunk.M;
+            double *roots = p->extra + b * M, *kept = roots + b * b * M;
+            gather_roots(&p->chunk, b, T, roots);
+            for (ptrdiff_t s = 0; s < p->chunk.L; ++s) {
+                eg_pass_slot(p, s, cameras);
+                eg_pass_keep(p, s, kept);
+                e.route.evaluate(p);
+            }
+            e.route.turn(p, roots, NULL, kept, envelope, &e.group, NULL, e.reduced);
+        }
+        double *sums = Z + b * b * lanes;
+        for (ptrdiff_t lane = 0; lane < e.group.lanes; ++lane)
+            e.route.marginal(&e.route, envelope, &e.group, lane, X, Z + b * b * lane,
+                             coupled ? sums + size * e.group.first[lane] : NULL);
+        const double *own = Z, *across = sums;
+        for (ptrdiff_t k = c; k < last; ++k) {
+            const eg_chunk chunk = eg_chunk_of(bundle, k);
+            double *roots = p->extra;
+            gather_roots(&chunk, b, T, roots);
+            around_roots(&chunk, b, roots, own, marginals);
+            if (coupled)
+                across_roots(&e.route, &chunk, roots, first, across, coupled);
+            for (ptrdiff_t j = 0; j < chunk.M && chunk.count[j]; ++j) {
+                own += b * b;
+                across += coupled ? size * chunk.count[j] : 0;
+            }
+        }
+    }
+    const int failed = !Z;
+    eg_release(Z);
+    elimination_end(&e, NULL);
+    return failed;
 }

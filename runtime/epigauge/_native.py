@@ -150,7 +150,8 @@ _TYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "bundle_refine_points": (_I, (*_RANGE, *[_P] * 5)),
     "bundle_inverse_roots": (_I, (_N, _N, _P, _P, _N, _D, _P, _P, _P)),
     "bundle_schur": (_I, (*_RANGE, *[_P] * 7)),
-    "bundle_couple": (_I, (*_RANGE, *[_P] * 7)),
+    "bundle_couple": (_I, (*_RANGE, *[_P] * 3, _N, *[_P] * 4)),
+    "bundle_marginals": (_I, (*_RANGE, *[_P] * 8)),
     "bundle_point_steps": (_D, (_N, _N, *[_P] * 4, _N, _P)),
     "bundle_camera_blocks": (None, (_P,) * 5),
     "bundle_pair_blocks": (None, (_P, _N, _P, _P)),
@@ -161,8 +162,10 @@ _TYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "resect": (_I, (_N, _P, _P, _D, _D, _N, _P)),
     "bundle_minimize": (_I, (_P,) * 10),
     "envelope_factor": (_I, (_P, _P)),
+    "envelope_invert": (_I, (_P, _P)),
     "envelope_solve": (None, (_P, _P, _N, _P)),
     "skyline_reduce": (None, (_P, _P, _P, _N, _P, _P, _P, _P)),
+    "skyline_spread": (None, (_P, _P, _P, _N, _P, _N, _P, _P, _P)),
 }
 
 

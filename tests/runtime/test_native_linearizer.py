@@ -149,6 +149,10 @@ def assert_same(at: Scene, loss: Loss, **options: Any) -> None:
         for name, vector in (("to_points", x), ("to_cameras", y)):
             pair = (getattr(part.coupling, name)(root, vector) for part in (a, b))
             assert relative(*pair) < 1e-10, name
+        for name, vectors in (("to_points", x), ("to_cameras", y)):
+            columns = np.stack([vectors, -2.0 * vectors, 0.1 * vectors], axis=2)
+            pair = (getattr(part.coupling, name)(root, columns) for part in (a, b))
+            assert relative(*pair) < 1e-10, name
     assert relative(a.coupling.diagonal(T), b.coupling.diagonal(T)) < 1e-10
     columns = np.stack([x, -2.0 * x], axis=2)
     assert relative(P.times(columns), P_b.times(columns)) < 1e-10
@@ -156,7 +160,45 @@ def assert_same(at: Scene, loss: Loss, **options: Any) -> None:
     A, right = 0.1 * rng.standard_normal((n, d, d - 1)), rng.standard_normal((n, d - 1, 2))
     size = np.abs(np.linalg.eigvalsh(P_b.dense().reshape(n * d, -1))).max() * d
     U = np.broadcast_to(size * np.eye(d - 1), (n, d - 1, d - 1))
-    assert relative(P.factor(U, A).solve(right), P_b.factor(U, A).solve(right)) < 1e-10
+    factors = P.factor(U, A), P_b.factor(U, A)
+    assert relative(*(factor.solve(right) for factor in factors)) < 1e-10
+    if not options.get("factored", at.model.homogeneous):
+        assert_same_inverse(at, (a, b), factors, A, T)
+
+
+def assert_same_inverse(
+    at: Scene, normals: Any, factors: Any, A: Array, T: Array, rtol: float = 1e-10
+) -> None:
+    """Compare the blocks of the inverse that a skyline holds, and the points' own."""
+    n, d, _ = A.shape
+    K = 0.01 * A[:, :, :2]
+    found, expected = (factor.inverse() for factor in factors)
+    for one, other in zip(found.diagonals, expected.diagonals, strict=True):
+        assert relative(one, other) < rtol
+    X, X_b = found.spread(A, K), expected.spread(A, K)
+    assert relative(X.diagonal, X_b.diagonal) < rtol
+    seen = np.zeros((n, at.graph.n_points), np.bool_)
+    seen[at.graph.view, at.graph.point] = True
+    together = seen.astype(int) @ seen.T.astype(int) > 0
+    size = np.abs(X_b.X).max()
+    for i, k in np.ndindex(n, n):
+        block = X.block(i, k)
+        assert block is not None or not together[i, k]
+        if block is not None:
+            assert distance(block / size, X_b.block(i, k) / size) < rtol
+    (own, across), (own_b, across_b) = (
+        normal.coupling.marginals(T, blocks, coupled=True)
+        for normal, blocks in zip(normals, (X, X_b), strict=True)
+    )
+    assert relative(own, own_b) < rtol
+    assert relative(across, across_b) < 1e-6  # as the roots of points above
+    alone, none = normals[0].coupling.marginals(T, X, coupled=False)
+    np.testing.assert_array_equal(alone, own)
+    assert not none.size
+    for j in range(0, at.graph.n_points, 9):
+        views, W = at.reference(Loss()).coupling_of(at.cameras, at.points, j)
+        assert (np.diff(views) > 0).all()
+        assert W.shape == (len(views), d, T.shape[1])
 
 
 class TestParts:
@@ -232,7 +274,9 @@ class TestColumns:
             size = 12 * len(used) * np.abs(P_b.dense()).max()
             U = np.broadcast_to(size * np.eye(6), (12, 6, 6))
             right = x[:, :6, None]
-            assert relative(P.factor(U, A).solve(right), P_b.factor(U, A).solve(right)) < 1e-10
+            factors = P.factor(U, A), P_b.factor(U, A)
+            assert relative(*(factor.solve(right) for factor in factors)) < 1e-10
+            assert_same_inverse(at, (a, b), factors, A, T)
 
 
 class TestHostileInput:

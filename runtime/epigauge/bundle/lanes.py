@@ -132,10 +132,15 @@ class LaneLayout:
                 function("bundle_neighbours")(ctypes.byref(self._bundle), address(together))
                 self._skyline, self.order = narrow(together)
             if self.order is not None:
-                number = np.argsort(self.order)[graph.view]
+                number = self.number[graph.view]
                 rows = np.lexsort((number, graph.point))
                 self._pack(number[rows], self._q[:, rows], self._weights[rows])
         return self._skyline
+
+    @property
+    def number(self) -> Indices:
+        """Return the number of each camera in the order of the skyline, (n,)."""
+        return np.arange(self._graph.n_views) if self.order is None else np.argsort(self.order)
 
     def inward(self, cameras: Any) -> Any:
         """Return rows of cameras in the order of the skyline, contiguous; None stays None."""

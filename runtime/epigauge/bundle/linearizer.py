@@ -19,8 +19,10 @@ from epigauge.two_view.losses import Loss
 
 __all__ = [
     "LEAST_WEIGHT",
+    "CameraBlocks",
     "Coupling",
     "Factor",
+    "FactorInverse",
     "Linearizer",
     "Normal",
     "Pairs",
@@ -55,15 +57,43 @@ class PointRefinement:
     tolerance: float = 1e-12
 
 
+class CameraBlocks(Protocol):
+    """Blocks of the cameras' part of an inverse: of all pairs of views that see common points."""
+
+    @property
+    def diagonal(self) -> Array:
+        """Return the blocks of the views themselves, (n, d, d)."""
+
+    def block(self, i: int, k: int) -> Array | None:
+        """Return the block of two views, (d, d); None where it was not computed."""
+
+
+class FactorInverse(Protocol):
+    """The selected blocks of the inverse of a reduced system S, in its unknowns."""
+
+    @property
+    def diagonals(self) -> tuple[Array, Array]:
+        """Return those of S and S^-1, (n, a)."""
+
+    def spread(self, A: Array | None, K: Array) -> CameraBlocks:
+        """Return the blocks of A S^-1 A^T + K K^T for A (n, d, a) and K (n, d, k)."""
+
+
 class Factor(Protocol):
     """A factor of the reduced system of the cameras."""
 
     def solve(self, right: Array) -> Array:
         """Return the solution for right-hand sides (n, a, k)."""
 
+    def inverse(self) -> FactorInverse:
+        """Return the blocks of the inverse of all pairs of views that see common points."""
+
 
 class Pairs(Protocol):
     """P = W T T^T W^T, what the points take off the cameras' blocks."""
+
+    def without(self, F: Array) -> Pairs:
+        """Return P - F F^T, F (n, d, k); only blocks that P has are kept."""
 
     def factor(self, U: Array, A: Array | None) -> Factor:
         """Return a factor of U - A^T P A, blocks U (n, a, a) and A (n, d, a).
@@ -89,16 +119,39 @@ class Coupling(Protocol):
         """Tell whether the reduced system is to be stored and factored, or only iterated with."""
 
     def to_points(self, T: Array | None, x: Array) -> Array:
-        """Return T^T W^T x, (m, b), for x (n, d) and T (m, b, b), or one."""
+        """Return T^T W^T x, (m, b, ...), for x (n, d) or (n, d, k) and T (m, b, b), or one."""
 
     def to_cameras(self, T: Array | None, y: Array) -> Array:
-        """Return W T y, (n, d), for y (m, b) and T (m, b, b), or one."""
+        """Return W T y, (n, d, ...), for y (m, b) or (m, b, k) and T (m, b, b), or one."""
 
     def schur(self, T: Array, half: Array | None) -> tuple[Pairs, Array]:
         """Return P = W T T^T W^T, and W T half (n, d); half None is zero."""
 
     def diagonal(self, T: Array) -> Array:
         """Return the diagonal blocks of P, (n, d, d)."""
+
+    def cliques(self) -> NDArray[np.bool_]:
+        """Return some sets of views, (c, n), large ones: all blocks of a set are stored."""
+
+    def marginals(self, T: Array, cameras: CameraBlocks, coupled: bool) -> tuple[Array, Array]:
+        """Return the blocks of the whole inverse that belong to points.
+
+        Parameters
+        ----------
+        T : ndarray, shape (m, b, b)
+            T T^T is the inverse of a point's own block.
+        cameras : CameraBlocks
+            The cameras' part X of the inverse.
+        coupled : bool
+            Whether the second result is asked for.
+
+        Returns
+        -------
+        ndarray, shape (m, b, b)
+            T T^T + Y^T X Y with Y = W T T^T, of each point.
+        ndarray, shape (N, d, b) or (0, d, b)
+            -X Y, of the view and the point of each observation.
+        """
 
 
 @dataclass(frozen=True)

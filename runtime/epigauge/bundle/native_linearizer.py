@@ -33,7 +33,8 @@ from epigauge._native import (
     function,
 )
 from epigauge.bundle.lanes import LaneLayout, Range
-from epigauge.bundle.linearizer import Normal, PointRefinement
+from epigauge.bundle.linearizer import CameraBlocks, Normal, PointRefinement
+from epigauge.bundle.native_inverse import NativeBlocks, NativeInverse
 from epigauge.bundle.numpy_linearizer import DENSE_CAMERAS
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.skyline import Skyline, SkylineFactor
@@ -49,6 +50,9 @@ Indices = NDArray[np.intp]
 #: A reduced system is factored where that takes at most so many products of blocks, or so many an
 #: observation: about what a hundred conjugate gradients cost.
 _QUICK, _PATIENCE = 1e6, 20.0
+
+#: So many sets of views are offered as cliques.
+_CLIQUES = 64
 
 
 class NativeLinearizer:
@@ -255,12 +259,15 @@ class NativeLinearizer:
 
     def wide(self, cameras: Array) -> Array:
         """Return vectors or blocks of the skyline's order and width in their own, zeros added."""
-        own = self.layout.outward(cameras)
+        return self.spread_out(self.layout.outward(cameras), cameras.ndim - 1)
+
+    def spread_out(self, own: Array, axes: int = 2) -> Array:
+        """Return arrays (n, ...) with zeros for entries that are known, on so many axes."""
         if self._used is None:
             return own
-        d, k = self.model.tangent_size, cameras.ndim - 1
-        result = np.zeros((len(own), *[d] * k))
-        result[np.ix_(np.arange(len(own)), *[self._used] * k)] = own
+        d, rest = self.model.tangent_size, own.shape[1 + axes :]
+        result = np.zeros((len(own), *[d] * axes, *rest))
+        result[np.ix_(np.arange(len(own)), *[self._used] * axes)] = own
         return result
 
     def narrow(self, cameras: Array | None) -> Array | None:
@@ -276,16 +283,34 @@ class NativeLinearizer:
     # ---------------------------------------------------------------- passes
 
     def to_points(self, at: tuple[Array, Array], T: Array | None, x: Array) -> Array:
-        """Return T^T W^T x, (m, b)."""
-        points, inner, T = np.empty(at[1].shape), self.narrow(x), _contiguous(T)
-        self._each("bundle_couple", *map(address, (*at, T, inner, None, points, None)))
+        """Return T^T W^T x, (m, b, ...), for x (n, d, ...)."""
+        inner, T = self.narrow(x), _contiguous(T)
+        points = np.empty((*at[1].shape, *x.shape[2:]))
+        before = tuple(map(address, (*at, T)))
+        after = tuple(map(address, (inner, None, points, None)))
+        self._each("bundle_couple", *before, _columns(x), *after)
         return points
 
     def to_cameras(self, at: tuple[Array, Array], T: Array | None, y: Array) -> Array:
-        """Return W T y, (n, d)."""
+        """Return W T y, (n, d, ...), for y (m, b, ...)."""
         T, y = _contiguous(T), np.ascontiguousarray(y)  # C has addresses only: both are kept
-        before = tuple(map(address, (*at, T, None, y, None)))
-        return self.wide(self._summed("bundle_couple", before, (len(at[0]), self.width))[0])
+        before = (*map(address, (*at, T)), _columns(y), *map(address, (None, y, None)))
+        shape = len(at[0]), self.width, *y.shape[2:]
+        found = self._summed("bundle_couple", before, shape)[0]
+        return self.spread_out(self.layout.outward(found), 1)
+
+    def marginals(
+        self, at: tuple[Array, Array], T: Array, cameras: NativeBlocks, coupled: bool
+    ) -> tuple[Array, Array]:
+        """Return the points' blocks of an inverse, and those of each observation."""
+        (m, b), T = at[1].shape, np.ascontiguousarray(T)
+        found, graph = np.empty((m, b, b)), self.graph
+        across = np.empty((len(graph.point) if coupled else 0, self.width, b))
+        first = np.ascontiguousarray(graph.first)
+        before = (*map(address, (*at, T, cameras.X)), cameras.skyline.reference)
+        after = map(address, (found, first, across if coupled else None))
+        self._each("bundle_marginals", *before, *after, pairs=True)
+        return found, self.spread_out(across, 1)
 
     def schur(
         self, at: tuple[Array, Array], T: Array, half: Array | None, skyline: Skyline
@@ -295,14 +320,15 @@ class NativeLinearizer:
         before = (*map(address, (*at, T, half)), skyline.reference)
         shapes = ((skyline.blocks, self.pair_sums.size), (len(at[0]), self.width))
         pairs, cameras = self._summed("bundle_schur", before, *shapes, pairs=True)
-        return NativePairs(self, skyline, pairs), self.wide(cameras)
+        return NativePairs(self, skyline, pairs, self.pair_sums), self.wide(cameras)
 
-    def _each(self, name: str, *arguments: Any) -> None:
-        """Call a C function for all chunks, which write to places of their own."""
-        call = function(name)
-        self._share(
-            self._passes, lambda _, begin, end: call(self.reference, begin, end, *arguments)
-        )
+    def _each(self, name: str, *arguments: Any, pairs: bool = False) -> None:
+        """Call a C function for all chunks, which write to places of their own.
+
+        `pairs` tells that it works on pairs of observations.
+        """
+        call, ranges = function(name), self._pairs if pairs else self._passes
+        self._share(ranges, lambda _, begin, end: call(self.reference, begin, end, *arguments))
 
     def _summed(
         self, name: str, before: tuple[Any, ...], *shapes: tuple[int, ...], pairs: bool = False
@@ -375,6 +401,18 @@ class NativeCoupling:
         pairs, _ = self.linearizer.schur(self._at, T, None, alone)
         return self.linearizer.wide(pairs.blocks)
 
+    def cliques(self) -> NDArray[np.bool_]:
+        """Return some sets of views, (c, n), large ones: all blocks of a set are stored."""
+        own, first = np.arange(len(self.cameras)), self.linearizer.skyline.first
+        rows = np.unique(np.linspace(0, len(own) - 1, _CLIQUES).astype(np.intp))
+        inner = [(first[k] <= own) & (own <= k) & (first <= first[k]) for k in rows]
+        return np.array(inner)[:, self.linearizer.layout.number]
+
+    def marginals(self, T: Array, cameras: CameraBlocks, coupled: bool) -> tuple[Array, Array]:
+        """Return the points' blocks of an inverse, (m, b, b), and those of each observation."""
+        assert isinstance(cameras, NativeBlocks)
+        return self.linearizer.marginals(self._at, T, cameras, coupled)
+
     @property
     def _at(self) -> tuple[Array, Array]:
         return self.cameras, self.points
@@ -391,17 +429,22 @@ class NativePairs:
     skyline : Skyline
         Which blocks there are.
     sums : ndarray, shape (l, w)
-        What the C library has added up.
+        What the C library has added up, or blocks.
+    how : Blocks
+        How blocks are stored; those of the factored route are not.
     """
 
     linearizer: NativeLinearizer
     skyline: Skyline
     sums: Array
+    how: Blocks
 
     @cached_property
     def blocks(self) -> Array:
         """Return the blocks (l, k, k), rows for the column of the skyline's row."""
         own, d = self.linearizer, self.linearizer.width
+        if self.how.size == d * d:
+            return self.sums.reshape(-1, d, d)
         found = np.empty((len(self.sums), d, d))
         arrays = map(address, (self.sums, found))
         function("bundle_pair_blocks")(own.reference, len(found), *arrays)
@@ -413,11 +456,18 @@ class NativePairs:
         if A is None and d < own.model.tangent_size:
             A = np.broadcast_to(np.eye(own.model.tangent_size), U.shape)
         inner_U, inner_A = own.layout.inward(U), own.narrow(A)
-        if own.factored:
-            blocks, how = self.blocks, Blocks.dense(d)
-        else:
-            blocks, how = self.sums, own.pair_sums
-        return NativeFactor(own, self.skyline.factor(blocks, how, inner_U, inner_A))
+        blocks, how = (self.blocks, Blocks.dense(d)) if own.factored else (self.sums, self.how)
+        return NativeFactor(own, self.skyline, self.skyline.factor(blocks, how, inner_U, inner_A))
+
+    def without(self, F: Array) -> NativePairs:
+        """Return P - F F^T, F (n, d, k); only blocks that P has are kept."""
+        inner, (rows, columns) = self.linearizer.narrow(F), self.skyline.places
+        assert inner is not None
+        views = np.unique(np.nonzero(inner)[0])
+        some = np.flatnonzero(np.isin(rows, views) & np.isin(columns, views))
+        blocks = self.blocks.copy()
+        blocks[some] -= inner[columns[some]] @ np.swapaxes(inner[rows[some]], 1, 2)
+        return replace(self, sums=blocks, how=Blocks.dense(blocks.shape[1]))
 
     def times(self, x: Array) -> Array:
         """Return P x for x (n, d, k)."""
@@ -456,6 +506,7 @@ class NativeFactor:
     """A factor of the reduced system of the cameras, in the order of the skyline."""
 
     linearizer: NativeLinearizer
+    skyline: Skyline
     inner: SkylineFactor
 
     def solve(self, right: Array) -> Array:
@@ -463,6 +514,10 @@ class NativeFactor:
         layout, (n, a, k) = self.linearizer.layout, right.shape
         rows = layout.inward(right).reshape(n * a, k).T
         return layout.outward(self.inner.solve(rows).T.reshape(n, a, k))
+
+    def inverse(self) -> NativeInverse:
+        """Return the blocks of the inverse of all pairs of views, of the direct route."""
+        return NativeInverse(self.linearizer, self.skyline, self.inner.inverse())
 
 
 def _together(pool: ThreadPoolExecutor | None, calls: list[Callable[[], Any]]) -> list[Any]:
@@ -474,6 +529,11 @@ def _together(pool: ThreadPoolExecutor | None, calls: list[Callable[[], Any]]) -
         return [calls[0](), *(future.result() for future in pending)]
     finally:  # C has addresses only: after Ctrl-C, too, the arrays stay until it is done
         wait(pending)
+
+
+def _columns(x: Array) -> int:
+    """Return how many columns (n, d) or (n, d, k) are."""
+    return x.shape[2] if x.ndim == 3 else 1
 
 
 def _contiguous(array: Array | None) -> Array | None:

@@ -8,7 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.bundle.linearizer import LEAST_WEIGHT, Normal, PointRefinement, point_damping
+from epigauge.bundle.dense import DenseBlocks, DensePairs
+from epigauge.bundle.linearizer import (
+    LEAST_WEIGHT,
+    CameraBlocks,
+    Normal,
+    PointRefinement,
+    point_damping,
+)
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.cameras import CameraModel
 from epigauge.kernels import Table
@@ -18,6 +25,7 @@ from epigauge.two_view.losses import Loss
 __all__ = ["NumpyLinearizer", "inverse_roots", "normal_equations"]
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 #: Points are eliminated in chunks of about this many matrix entries, which bounds the memory.
 _CHUNK = 4_000_000
@@ -130,6 +138,19 @@ class NumpyLinearizer:
         weight = self.weights_at(r)
         return np.asarray(np.einsum("kin,kjn,n->nij", A, B, weight, optimize=True))
 
+    def coupling_of(self, cameras: Array, points: Array, point: int) -> tuple[Indices, Array]:
+        """Return the views of a point, (k,), and W of these edges, (k, d, b)."""
+        graph = self.graph
+        rows = slice(graph.first[point], graph.first[point + 1])
+        view = graph.view[rows]
+        alone = ObservationGraph(view, np.zeros(len(view), np.intp), graph.n_views, 1)
+        whitening = None if self.whitening is None else self.whitening[..., rows]
+        own = replace(self, graph=alone, q=self.q[:, rows], whitening=whitening)
+        r, A, B = own.observe(cameras, points[point][None])
+        weight = self._effective(self.weights[rows], r)[1]
+        W = np.einsum("kin,kjn,n->nij", A, B, weight, optimize=True)
+        return alone.simple.view, alone.sum_edges(W)
+
     def refine_points(
         self, cameras: Array, points: Array, how: PointRefinement
     ) -> tuple[Array, Array]:
@@ -169,10 +190,14 @@ class NumpyLinearizer:
         return inverse_roots(V, D, lam, g)
 
     def _costs(self, r: Array) -> tuple[Array, Array]:
+        rho, weight = self._effective(self.weights, r)
+        return self.graph.sum_points(rho), weight
+
+    def _effective(self, weights: Array, r: Array) -> tuple[Array, Array]:
+        """Return weighted robust squares of residuals, and weights in the normal equations."""
         rho, first, _ = self.loss(np.sum(r**2, axis=0))
         least = LEAST_WEIGHT * float(np.max(self.weights))
-        effective = np.maximum(self.weights * first, least)
-        return self.graph.sum_points(self.weights * rho), np.asarray(effective)
+        return weights * rho, np.maximum(weights * first, least)
 
     def _sums(self, Z_camera: Array, Z_point: Array) -> tuple[Array, Array]:
         x, y = Z_camera.T, Z_point.T
@@ -249,14 +274,15 @@ class StoredCoupling:
         return self.graph.n_views <= DENSE_CAMERAS
 
     def to_points(self, T: Array | None, x: Array) -> Array:
-        """Return T^T W^T x, (m, b)."""
-        y = self.graph.sum_points(np.einsum("nij,ni->nj", self.W, x[self.graph.view]))
-        return y if T is None else np.einsum("mij,mi->mj", T, y)
+        """Return T^T W^T x, (m, b, ...), for x (n, d, ...)."""
+        y = self.graph.sum_points(np.einsum("nij,ni...->nj...", self.W, x[self.graph.view]))
+        return y if T is None else np.einsum("mij,mi...->mj...", T, y)
 
     def to_cameras(self, T: Array | None, y: Array) -> Array:
-        """Return W T y, (n, d)."""
-        y = y if T is None else np.einsum("mij,mj->mi", T, y)
-        return self.graph.sum_views(np.einsum("nij,nj->ni", self.W, y[self.graph.point]))
+        """Return W T y, (n, d, ...), for y (m, b, ...)."""
+        y = y if T is None else np.einsum("mij,mj...->mi...", T, y)
+        moved = np.einsum("nij,nj...->ni...", self.W, y[self.graph.point])
+        return self.graph.sum_views(moved)
 
     def schur(self, T: Array, half: Array | None) -> tuple[DensePairs, Array]:
         """Return P = W T T^T W^T, and W T half (n, d); half None is zero."""
@@ -282,51 +308,32 @@ class StoredCoupling:
         Y = self._edges(T)
         return self.graph.simple.sum_views(Y @ np.swapaxes(Y, 1, 2))
 
+    def cliques(self) -> NDArray[np.bool_]:
+        """Return the set of all views, (1, n): all blocks are stored."""
+        return np.ones((1, self.graph.n_views), np.bool_)
+
+    def marginals(self, T: Array, cameras: CameraBlocks, coupled: bool) -> tuple[Array, Array]:
+        """Return the points' blocks of an inverse, (m, b, b), and those of each observation."""
+        assert isinstance(cameras, DenseBlocks)
+        graph, all_Y = self.graph.simple, self._edges(T)
+        inner, across = np.zeros_like(T), np.empty_like(all_Y)
+        counts, (_, d, b) = np.diff(graph.first), all_Y.shape
+        for k in np.unique(counts):
+            those = np.flatnonzero(counts == k)
+            size = max(1, _CHUNK // int((k * d) ** 2))
+            for begin in range(0, len(those), size):
+                chunk = those[begin : begin + size]
+                rows = graph.first[chunk][:, None] + np.arange(k)
+                Y = all_Y[rows].reshape(len(chunk), k * d, b)
+                XY = cameras.among(graph.view[rows]) @ Y
+                inner[chunk] = np.eye(b) + np.swapaxes(Y, 1, 2) @ XY
+                across[rows] = -(XY @ np.swapaxes(T[chunk], 1, 2)).reshape(len(chunk), k, d, b)
+        found = T @ (0.5 * (inner + np.swapaxes(inner, 1, 2))) @ np.swapaxes(T, 1, 2)
+        return found, self.graph.of_edges(across) if coupled else across[:0]
+
     def _edges(self, T: Array) -> Array:
         graph = self.graph
         return graph.sum_edges(self.W) @ T[graph.simple.point]
-
-
-@dataclass(frozen=True)
-class DensePairs:
-    """P as an array (n, d, n, d)."""
-
-    P: Array
-
-    def factor(self, U: Array, A: Array | None) -> DenseFactor:
-        """Return a factor of U - A^T P A, blocks U (n, a, a) and A (n, d, a)."""
-        n, a, _ = U.shape
-        blocks = -self.P.transpose(0, 2, 1, 3)
-        if A is not None:
-            blocks = np.swapaxes(A, 1, 2)[:, None] @ blocks @ A
-        S = blocks.transpose(0, 2, 1, 3).copy()
-        S[np.arange(n), :, np.arange(n), :] += U
-        S = S.reshape(n * a, n * a)
-        if not np.isfinite(S).all():
-            raise np.linalg.LinAlgError("the reduced system is not finite")
-        np.linalg.cholesky(S)  # raises where S is not positive definite
-        return DenseFactor(S)
-
-    def times(self, x: Array) -> Array:
-        """Return P x for x (n, d, k)."""
-        n, d, k = x.shape
-        return (self.P.reshape(n * d, n * d) @ x.reshape(n * d, k)).reshape(x.shape)
-
-    def dense(self) -> Array:
-        """Return P, (n, d, n, d)."""
-        return self.P
-
-
-@dataclass(frozen=True)
-class DenseFactor:
-    """The matrix itself (n a, n a), positive definite: NumPy solves from it."""
-
-    S: Array
-
-    def solve(self, right: Array) -> Array:
-        """Return the solution for right-hand sides (n, a, k)."""
-        flat = right.reshape(len(self.S), right.shape[2])
-        return np.asarray(np.linalg.solve(self.S, flat)).reshape(right.shape)
 
 
 def _solved(A: Array, b: Array) -> Array:

@@ -76,3 +76,11 @@ class ObservationGraph:
         if self.first_of_edge is None:
             return values
         return np.add.reduceat(values, self.first_of_edge, axis=0)
+
+    def of_edges(self, values: Array) -> Array:
+        """Return the values (e, ...) of the edges of `simple` for each observation, (N, ...)."""
+        if self.first_of_edge is None:
+            return values
+        edge = np.zeros(len(self.view), np.intp)
+        edge[self.first_of_edge[1:]] = 1
+        return values[np.cumsum(edge)]

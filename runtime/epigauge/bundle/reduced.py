@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.bundle.linearizer import Coupling, Normal, Pairs
+from epigauge.bundle.linearizer import CameraBlocks, Coupling, Normal, Pairs
 from epigauge.bundle.ties import Ties
 
 __all__ = ["Bordered", "Iterated", "conjugate_gradients", "reduced_system"]
@@ -63,6 +63,7 @@ class Bordered:
             inner = ties.shared(own) + lam * np.eye(ties.n_shared)
             inner = inner - np.einsum("iar,ias->rs", self._across, self._moved)
             self._inner = 0.5 * (inner + inner.T)
+            self._outer = np.diagonal(ties.shared(own)) + lam
             np.linalg.cholesky(self._inner)  # raises where it is not positive definite
 
     def solve(self, x: Array, s: Array) -> tuple[Array, Array]:
@@ -72,6 +73,25 @@ class Bordered:
             return x, s
         s = np.linalg.solve(self._inner, s - np.einsum("iar,iak->rk", self._across, x))
         return x - self._moved @ s, s
+
+    def inverse(self, ties: Ties) -> tuple[CameraBlocks, float]:
+        """Return blocks of S^-1 in own tangents, and the largest variance inflation S_ii (S^-1)_ii.
+
+        Of an unknown that nothing but rounding determines, the inflation has no end.
+        """
+        inverse = self._factor.inverse()
+        of_S, of_inverse = inverse.diagonals
+        if self._across is None:
+            n, d = of_S.shape if ties.A is None else ties.A.shape[:2]
+            largest = (of_S * of_inverse).max(initial=0.0)
+            return inverse.spread(ties.A, np.zeros((n, d, 0))), float(largest)
+        root = np.linalg.inv(np.linalg.cholesky(self._inner)).T
+        # S^-1 has the blocks M + Z C Z^T, -Z C and C of the views' own and the shared unknowns.
+        own = self._moved @ root
+        shared = self._outer * np.sum(root**2, axis=1)
+        whole = of_S * (of_inverse + np.sum(own**2, axis=2))
+        found = inverse.spread(ties.A, ties.cameras(own, -root))
+        return found, float(max(whole.max(initial=0.0), shared.max()))
 
 
 class Iterated:

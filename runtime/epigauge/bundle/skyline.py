@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from epigauge import _native
 from epigauge._library import address
-from epigauge._native import PANEL, Blocks, function
+from epigauge._native import PANEL, Blocks, checked, function
 
-__all__ = ["Skyline", "SkylineFactor", "narrow"]
+__all__ = ["Skyline", "SkylineFactor", "SkylineInverse", "narrow"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -89,6 +89,12 @@ class Skyline:
         arrays = map(address, (self.first, self.slot))
         return ctypes.byref(_native.Envelope(self.n, *arrays))
 
+    def diagonal_of(self, S: Array, size: int) -> Array:
+        """Return the first entries of the diagonal of a matrix in panels."""
+        at = np.arange(size)
+        block = self.slot[1:][at // PANEL] - 1
+        return np.asarray(S[block * PANEL**2 + (PANEL + 1) * (at % PANEL)])
+
     @lru_cache(maxsize=8)  # noqa: B019  # a skyline lives as long as its problem
     def panels(self, a: int) -> Skyline:
         """Return the skyline in rows of panels, for blocks of (a, a) entries."""
@@ -127,18 +133,20 @@ class Skyline:
             a,
             *map(address, (blocks, U, A, S)),
         )
+        diagonal = panels.diagonal_of(S, a * self.n)
         if function("envelope_factor")(panels.reference, address(S)):
             raise np.linalg.LinAlgError("the reduced system is not positive definite")
-        return SkylineFactor(panels, S, a * self.n)
+        return SkylineFactor(panels, S, a * self.n, diagonal)
 
 
 @dataclass(frozen=True)
 class SkylineFactor:
-    """A Cholesky factor in panels."""
+    """A Cholesky factor in panels, and the diagonal of the matrix."""
 
     panels: Skyline
     S: Array
     unknowns: int
+    diagonal: Array
 
     def solve(self, right: Array) -> Array:
         """Return the solutions for right-hand sides (k, unknowns)."""
@@ -146,6 +154,23 @@ class SkylineFactor:
         x[:, : self.unknowns] = right
         function("envelope_solve")(self.panels.reference, address(self.S), len(x), address(x))
         return x[:, : self.unknowns]
+
+    def inverse(self) -> SkylineInverse:
+        """Return the blocks of the inverse within the skyline."""
+        Z = self.S.copy()
+        checked(function("envelope_invert")(self.panels.reference, address(Z)))
+        found = self.panels.diagonal_of(Z, self.unknowns)
+        return SkylineInverse(self.panels, Z, self.unknowns, (self.diagonal, found))
+
+
+@dataclass(frozen=True)
+class SkylineInverse:
+    """The blocks of S^-1 within a skyline, in panels, and the diagonals of S and S^-1."""
+
+    panels: Skyline
+    Z: Array
+    unknowns: int
+    diagonals: tuple[Array, Array]
 
 
 def narrow(together: NDArray[np.bool_]) -> tuple[Skyline, Indices | None]:

@@ -309,21 +309,18 @@ class _Damped:
     def solve(self, x: Array, s: Array, y: Array) -> tuple[Array, Array, Array]:
         """Return this times (n, a, k), (r, k), (m, b', k)."""
         coupling, half = self._system.normal.coupling, np.swapaxes(self._root, 1, 2) @ y
-        columns = range(half.shape[2])
-        right = np.stack(
-            [coupling.to_cameras(self._T, self._wide(half[..., k])) for k in columns], axis=2
-        )
+        right = coupling.to_cameras(self._T, self._wide(half))
         x, s = self._reduced.solve(x - self.ties.local(right), s - self.ties.shared(right))
-        own = self.ties.cameras(x, s)
-        coupled = np.stack([self._coupled(own[..., k]) for k in columns], axis=2)
-        return x, s, self._root @ (half - coupled)
+        return x, s, self._root @ (half - self._coupled(self.ties.cameras(x, s)))
 
     def _coupled(self, own: Array) -> Array:
-        """Return T^T W^T own for roots T of the points' unknowns, (m, b')."""
+        """Return T^T W^T own for roots T of the points' unknowns, (m, b', ...)."""
         coupled = self._system.normal.coupling.to_points(self._T, np.ascontiguousarray(own))
         return coupled[:, : self._root.shape[2]]
 
     def _wide(self, half: Array) -> Array:
-        """Return (m, b') with zeros where the points have fewer unknowns than coordinates."""
+        """Return (m, b', ...) with zeros where the points have fewer unknowns than coordinates."""
         lack = self._T.shape[2] - half.shape[1]
-        return np.ascontiguousarray(np.pad(half, ((0, 0), (0, lack))) if lack else half)
+        if not lack:
+            return np.ascontiguousarray(half)
+        return np.pad(half, ((0, 0), (0, lack), *[(0, 0)] * (half.ndim - 2)))

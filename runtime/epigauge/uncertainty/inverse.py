@@ -3,7 +3,8 @@
 The normal matrix N of the unknowns is singular along the gauge freedom. `Inverse` holds
 X = (N + F F^T)^-1, F along the free motions of the cameras: a generalised inverse of N, from which
 every datum is reached by an S-transformation (`epigauge.uncertainty.datum`). Only the matrix of
-the cameras is formed; blocks of points follow from it and their own small blocks.
+the cameras is factored, within its skyline, and only the blocks of its inverse there are computed
+(Takahashi's selected inversion): blocks of points follow from them and their own small blocks.
 """
 
 from __future__ import annotations
@@ -15,12 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.bundle.dampings import Covariant
+from epigauge.bundle.linearizer import CameraBlocks, Coupling
 from epigauge.bundle.null_space import generators
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.priors import Priors
+from epigauge.bundle.reduced import Bordered
 from epigauge.bundle.solve import Border, BundleSystem
-from epigauge.bundle.ties import Ties
+from epigauge.bundle.ties import Ties, congruent
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 
@@ -35,8 +38,9 @@ Part = tuple[int | None, int | None]
 #: Singular values of what holds the gauge below this, of the largest one, are rounding.
 _FREE = 1e-9
 
-#: Least eigenvalue of the cameras' matrix where its diagonal is about one.
-_SINGULAR = 1e-13
+#: An unknown whose variance grows by more than this when all others are unknown, too, is not
+#: determined: rounding leaves no more.
+_SINGULAR = 1e13
 
 _SUMS = ("U", "V", "g_cameras", "g_points")
 
@@ -44,8 +48,8 @@ _SUMS = ("U", "V", "g_cameras", "g_points")
 #: as much is added, which leaves everything else as it is.
 _RAY = 1e-12
 
-#: Points are gone through in chunks of about this many matrix entries, which bounds the memory.
-_CHUNK = 2_000_000
+#: Blocks of so many points with all views are kept while they may be asked for again.
+_CROSSED = 64
 
 
 @dataclass(frozen=True)
@@ -106,9 +110,13 @@ class Motions:
 
         It has no part in points, which N + F F^T would couple.
         """
-        weight = np.einsum("nii->ni", system.normal.U).mean(axis=0)[:, None]
-        columns = self.cameras @ self.loose
-        return np.asarray(weight * columns / np.sqrt(np.sum(weight * columns**2, axis=(0, 1))))
+        weights, columns = self.weights(system), self.cameras @ self.loose
+        return np.asarray(weights * columns / np.sqrt(np.sum(weights * columns**2, axis=(0, 1))))
+
+    @staticmethod
+    def weights(system: BundleSystem) -> Array:
+        """Return how much the images make of an entry of a tangent, on average, (d, 1)."""
+        return np.asarray(np.einsum("nii->ni", system.normal.U).mean(axis=0)[:, None])
 
 
 def _rows(rows: Array, motions: Array) -> Array:
@@ -131,18 +139,28 @@ def _null(rows: Array) -> Array:
 class Inverse:
     """X = X_0 + L M L^T, with X_0 that of the images and priors of one view or point.
 
-    All in own tangents: d numbers a camera, three a point.
+    All in own tangents: d numbers a camera, three a point. Of the cameras' part of X_0 the blocks
+    of views that see common points are stored, all that blocks of single views and points need;
+    any other follows from the factor.
 
     Attributes
     ----------
-    graph : ObservationGraph
-        One edge a pair of view and point.
-    cameras : ndarray, shape (n, d, n, d)
-        The cameras' part of X_0.
+    coupling : Coupling
+        W.
+    T : ndarray, shape (m, 3, 3)
+        T T^T is the inverse V^-1 of the points' own blocks.
     V_inverse : ndarray, shape (m, 3, 3)
-        Inverse blocks of the points.
-    W, Y : ndarray, shape (N, d, 3)
-        Coupling of each edge, and that times V^-1.
+        V^-1.
+    reduced : Bordered
+        The factor of the cameras' part.
+    ties : Ties
+        From the unknowns of that to own tangents.
+    blocks : CameraBlocks
+        The stored blocks of the cameras' part.
+    reference : NumpyLinearizer
+        The observations, for W of a point.
+    at : tuple of ndarray, shape (n, c), (m, 3)
+        The estimate.
     L_cameras, L_points : ndarray, shape (n, d, q), (m, 3, q)
         L.
     M : ndarray, shape (q, q)
@@ -153,11 +171,14 @@ class Inverse:
         Points that their observations leave open along a ray.
     """
 
-    graph: ObservationGraph
-    cameras: Array
+    coupling: Coupling
+    T: Array
     V_inverse: Array
-    W: Array
-    Y: Array
+    reduced: Bordered
+    ties: Ties
+    blocks: CameraBlocks
+    reference: NumpyLinearizer
+    at: tuple[Array, Array]
     L_cameras: Array
     L_points: Array
     M: Array
@@ -179,9 +200,11 @@ class Inverse:
             Where the observations leave something undetermined beside the gauge.
         """
         motions = Motions.of(system, priors, kernels)
+        open_rays = undetermined(system.V)
         try:
             with np.errstate(over="raise", divide="raise", invalid="raise"):
-                cameras, V_inverse = _cameras(system, motions)
+                F = _held(system, motions)
+                T, reduced, ties, blocks = _cameras(system, F, open_rays)
         except (np.linalg.LinAlgError, FloatingPointError):
             raise ArgumentError(
                 "reconstruction",
@@ -189,20 +212,18 @@ class Inverse:
                 "views and points in general position, and only intrinsics in `refine` that they "
                 "determine",
             ) from None
-        graph = reference.graph
-        W = graph.sum_edges(reference.coupling_blocks(system.cameras, system.points))
-        edges = graph.simple
-        parts = edges, cameras, V_inverse, W, W @ V_inverse[edges.point]
-        none = np.zeros((*cameras.shape[:2], 0)), np.zeros((len(V_inverse), 3, 0)), np.zeros((0, 0))
-        open_rays = undetermined(system.V)
-        plain = Inverse(*parts, *none, motions, open_rays)
+        n, d = system.normal.g_cameras.shape
+        parts = system.normal.coupling, T, T @ np.swapaxes(T, 1, 2), reduced, ties, blocks
+        at = system.cameras, system.points
+        none = np.zeros((n, d, 0)), np.zeros((len(T), 3, 0)), np.zeros((0, 0))
+        plain = Inverse(*parts, reference, at, *none, motions, open_rays)
         if not motions.held.size and system.constraints is None:
             return plain
         # Known distances couple points: their few columns B are added. What priors hold of the
         # gauge is held by F no longer: (N + F F^T) G = F F^T G + (what priors add) G gives X F and
         # what is left of it without a difference of large numbers.
-        B = system.constraints or Border(np.zeros((*cameras.shape[:2], 0)), none[1])
-        F, G = motions.lifted(system), motions.along(motions.loose)
+        B = system.constraints or Border(*none[:2])
+        G = motions.along(motions.loose)
         back = np.linalg.inv(np.einsum("ndk,ndl->kl", F, G[0]))
         first = motions.open.shape[1]
         alone = added_by_priors(system, priors)
@@ -215,37 +236,52 @@ class Inverse:
         left = np.einsum("ndk,ndl->kl", F[..., first:], weak[0])
         inner = np.block([[np.eye(across.shape[0]) + products(B, XB), across], [across.T, -left]])
         M = -np.linalg.inv(0.5 * (inner + inner.T))
-        return Inverse(*parts, *L, 0.5 * (M + M.T), motions, open_rays)
+        return replace(plain, L_cameras=L[0], L_points=L[1], M=0.5 * (M + M.T))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Return (n, d)."""
+        n, d, _ = self.L_cameras.shape
+        return n, d
 
     def apply(self, cameras: Array, points: Array) -> tuple[Array, Array]:
         """Return X times columns (n, d, k) and (m, 3, k)."""
-        edges, (n, d) = self.graph, self.cameras.shape[:2]
-        coupled = cameras - edges.sum_views(self.Y @ points[edges.point])
-        flat = self.cameras.reshape(n * d, n * d) @ coupled.reshape(n * d, -1)
-        x = flat.reshape(n, d, -1)
-        back = edges.sum_points(np.swapaxes(self.W, 1, 2) @ x[edges.view])
-        y = self.V_inverse @ (points - back)
+        own = self.V_inverse @ points
+        x = self._solved(cameras - self.coupling.to_cameras(None, own))
+        y = own - self.V_inverse @ self.coupling.to_points(None, np.ascontiguousarray(x))
         if self.M.size:
             small = self.M @ products((self.L_cameras, self.L_points), (cameras, points))
             x, y = x + self.L_cameras @ small, y + self.L_points @ small
         return x, y
 
     @property
+    def graph(self) -> ObservationGraph:
+        """The observations, one edge a pair of view and point."""
+        return self.reference.graph.simple
+
+    @cached_property
+    def W(self) -> Array:
+        """Coupling of each edge, (E, d, 3)."""
+        return self.reference.graph.sum_edges(self.reference.coupling_blocks(*self.at))
+
+    @property
     def sizes(self) -> tuple[int, int, int]:
         """Numbers of cameras, of a camera's tangent, and of points."""
-        return (*self.cameras.shape[:2], len(self.V_inverse))
+        return (*self.L_cameras.shape[:2], len(self.T))
 
     def block(self, first: Part, second: Part) -> Array:
         """Return the block of X of two parts."""
         (i, a), (k, b) = first, second
         if a is not None and b is not None:
-            found = self.pair(a, b)
+            found = self._points(a, b)
         elif a is not None:
-            found = self.cross(a)[k].T
+            found = self._cross(a)[k].T
         elif b is not None:
-            found = self.cross(b)[i]
+            found = self._cross(b)[i]
         else:
-            found = self.cameras[i, :, k]
+            assert i is not None
+            assert k is not None
+            found = self._views(i, k)
         return np.asarray(found + self._low(first) @ self.M @ self._low(second).T)
 
     def _low(self, part: Part) -> Array:
@@ -254,47 +290,69 @@ class Inverse:
     @cached_property
     def diagonals(self) -> tuple[Array, Array]:
         """The diagonal blocks of X of cameras (n, d, d) and points (m, 3, 3)."""
-        n = len(self.cameras)
-        blocks = self.cameras[np.arange(n), :, np.arange(n)], self.points
-        low = self.L_cameras, self.L_points
-        both = (X + L @ self.M @ np.swapaxes(L, 1, 2) for X, L in zip(blocks, low, strict=True))
-        cameras, points = both
-        return cameras, points
+        points = self.coupling.marginals(self.T, self.blocks, coupled=False)[0]
+        both = (self.blocks.diagonal, self.L_cameras), (points, self.L_points)
+        of_views, of_points = (X + L @ self.M @ np.swapaxes(L, 1, 2) for X, L in both)
+        return of_views, of_points
 
-    @cached_property
-    def points(self) -> Array:
-        """Return the points' diagonal blocks of X_0, (m, 3, 3)."""
-        edges = self.graph
-        found = self.V_inverse.copy()
-        counts, d = np.diff(edges.first), self.cameras.shape[1]
-        by_pair = np.ascontiguousarray(self.cameras.transpose(0, 2, 1, 3))
-        for k in np.unique(counts):
-            those = np.flatnonzero(counts == k)
-            size = max(1, _CHUNK // int((k * d) ** 2))
-            for begin in range(0, len(those), size):
-                chunk = those[begin : begin + size]
-                rows = edges.first[chunk][:, None] + np.arange(k)
-                views = edges.view[rows]
-                among = by_pair[views[:, :, None], views[:, None, :]]
-                Y = self.Y[rows].reshape(len(chunk), k * d, 3)
-                among = among.transpose(0, 1, 3, 2, 4).reshape(len(chunk), k * d, k * d)
-                found[chunk] += np.swapaxes(Y, 1, 2) @ (among @ Y)
+    def _views(self, i: int, k: int) -> Array:
+        """Return the block of X_0 of two views, (d, d)."""
+        found = self.blocks.block(i, k)
+        if found is None:
+            n, d, _ = self.sizes
+            right = np.zeros((n, d, d))
+            right[k] = np.eye(d)
+            found = self._solved(right)[i]
         return found
 
-    def cross(self, point: int) -> Array:
+    def _cross(self, point: int) -> Array:
         """Return the blocks of X_0 of all cameras and a point, (n, d, 3)."""
-        rows = slice(self.graph.first[point], self.graph.first[point + 1])
-        n, d = self.cameras.shape[:2]
-        views = self.graph.view[rows]
-        among = self.cameras[:, :, views].reshape(n, d, -1)
-        return np.asarray(-among @ self.Y[rows].reshape(-1, 3))
+        found = self._crossed.get(point)
+        if found is None:
+            views, Y = self._factors(point)
+            right = np.zeros((*self.sizes[:2], Y.shape[2]))
+            right[views] = Y
+            found = -self._solved(right)
+            if len(self._crossed) >= _CROSSED:
+                self._crossed.clear()
+            self._crossed[point] = found
+        return found
 
-    def pair(self, i: int, j: int) -> Array:
+    def _points(self, i: int, j: int) -> Array:
         """Return the block of X_0 of two points, (3, 3)."""
-        rows = slice(self.graph.first[j], self.graph.first[j + 1])
-        crossed = self.cross(i)[self.graph.view[rows]]
-        found = -np.einsum("ndi,ndj->ij", crossed, self.Y[rows])
+        views, Y = self._factors(j)
+        found = -np.einsum("ndi,ndj->ij", self._cross(i)[views], Y)
         return np.asarray(found + (self.V_inverse[i] if i == j else 0.0))
+
+    @cached_property
+    def _crossed(self) -> dict[int, Array]:
+        return {}
+
+    def _factors(self, point: int) -> tuple[Indices, Array]:
+        """Return the views of a point, and W V^-1 of these edges, (k, d, 3)."""
+        views, W = self.reference.coupling_of(*self.at, point)
+        return views, W @ self.V_inverse[point]
+
+    def _solved(self, own: Array) -> Array:
+        """Return the cameras' part of X_0 times columns (n, d, k)."""
+        return self.ties.cameras(*self.reduced.solve(self.ties.local(own), self.ties.shared(own)))
+
+
+def _held(system: BundleSystem, motions: Motions) -> Array:
+    """Return F (n, d, f): lifted motions, but of some views only, that hold the whole gauge.
+
+    F F^T couples these views with one another. All of them share points, so that the reduced
+    system keeps its blocks; of such sets that is taken whose views hold the gauge most firmly.
+    """
+    F = motions.lifted(system)
+    if not F.shape[2]:
+        return F
+    unit = np.sqrt(motions.weights(system)) * (motions.cameras @ motions.loose)
+    unit /= np.sqrt(np.sum(unit**2, axis=(0, 1)))
+    sets = system.normal.coupling.cliques()
+    grams = np.tensordot(sets.astype(float), np.swapaxes(unit, 1, 2) @ unit, 1)
+    firmest = sets[int(np.argmax(np.linalg.eigvalsh(grams)[:, 0]))]
+    return np.where(firmest[:, None, None], F, 0.0)
 
 
 def added_by_priors(system: BundleSystem, priors: Priors | None) -> tuple[Array, Array]:
@@ -312,43 +370,31 @@ def products(first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
     return np.asarray(cameras + np.einsum("mik,mil->kl", first[1], second[1], optimize=True))
 
 
-def _cameras(system: BundleSystem, motions: Motions) -> tuple[Array, Array]:
-    """Return the cameras' part of X_0, (n, d, n, d), and the inverse point blocks (m, 3, 3)."""
+def _cameras(
+    system: BundleSystem, F: Array, open_rays: NDArray[np.bool_]
+) -> tuple[Array, Bordered, Ties, CameraBlocks]:
+    """Return roots T of the points' inverse blocks, and the cameras' part of the inverse.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Where it is singular to rounding.
+    """
     W = Covariant().blocks(system)
     whitening = np.linalg.inv(np.swapaxes(np.linalg.cholesky(W.cameras), 1, 2))
-    ties: Ties = system.ties.then(whitening, None).scaled(1.0 / np.sqrt(W.shared))
-    V = system.V + _RAY * undetermined(system.V)[:, None, None] * _sized(system.V)
-    root, _ = system.inverse_roots(V, W.points, 0.0, system.gradients[2])
+    ties = system.ties.then(whitening, None).scaled(1.0 / np.sqrt(W.shared))
+    V = system.V
+    if open_rays.any():
+        V = V + _RAY * open_rays[:, None, None] * _sized(V)
+    root, _ = system.inverse_roots(V, V, 0.0, system.gradients[2])
     T = system.own_roots(root)
-    white = BundleSystem(
-        system.normal,
-        system.inverse_roots,
-        ties,
-        model=system.model,
-        cameras=system.cameras,
-        points=system.points,
-    )
-    reduced = white.reduced(root)
-    n, d = system.normal.g_cameras.shape
-    a = (whitening if ties.A is None else ties.A).shape[2]
-    A = np.broadcast_to(np.eye(d), (n, d, d)) if ties.A is None else ties.A
-    lifted = motions.lifted(system)
-    F = np.zeros((len(reduced), lifted.shape[2]))
-    F[: n * a] = ties.local(lifted).reshape(n * a, -1)
-    if ties.n_shared:
-        F[n * a :] = ties.shared(lifted)
-    reduced += F @ F.T
-    frozen = np.flatnonzero(~A.any(axis=1).ravel())
-    scale = 1.0 / np.sqrt(np.diagonal(reduced))
-    unit = scale[:, None] * reduced * scale
-    values = np.linalg.eigvalsh(unit)
-    if not values[0] > _SINGULAR * values[-1]:
-        raise np.linalg.LinAlgError
-    inverse = scale[:, None] * np.linalg.inv(unit) * scale
-    inverse[frozen], inverse[:, frozen] = 0.0, 0.0
-    half = _own(ties, inverse, n, a)
-    whole = _own(ties, np.ascontiguousarray(half.T), n, a)
-    return (0.5 * (whole + whole.T)).reshape(n, d, n, d), T @ np.swapaxes(T, 1, 2)
+    pairs, _ = system.normal.coupling.schur(T, None)
+    white = congruent(ties.A, system.normal.U)
+    reduced = Bordered(pairs.without(F), system.normal.U, ties, white, 0.0)
+    blocks, inflation = reduced.inverse(ties)
+    if not inflation < _SINGULAR:
+        raise np.linalg.LinAlgError("something is undetermined")
+    return T, reduced, ties, blocks
 
 
 def _sized(V: Array) -> Array:
@@ -360,11 +406,16 @@ def _sized(V: Array) -> Array:
 def undetermined(V: Array) -> NDArray[np.bool_]:
     """Return which points their observations leave open along a ray, (m,)."""
     size = np.einsum("mii->m", V) / V.shape[1]
-    least = np.linalg.eigvalsh(V / np.where(size > 0.0, size, 1.0)[:, None, None])[:, 0]
-    return np.asarray(least < _RAY)
+    unit = V / np.where(size > 0.0, size, 1.0)[:, None, None]
+    found = np.zeros(len(V), np.bool_)
+    # The least eigenvalue is at least the determinant over the mean square of the others.
+    doubtful = np.flatnonzero(~(_determinants(unit) > 10.0 * _RAY))
+    found[doubtful] = np.linalg.eigvalsh(unit[doubtful])[:, 0] < _RAY
+    return found
 
 
-def _own(ties: Ties, columns: Array, n: int, a: int) -> Array:
-    """Return own tangents (n d, k) of columns (n a + r, k) of unknowns."""
-    own = ties.cameras(columns[: n * a].reshape(n, a, -1), columns[n * a :])
-    return np.asarray(own.reshape(-1, columns.shape[1]))
+def _determinants(V: Array) -> Array:
+    """Return those of blocks, (m, b, b) -> (m,)."""
+    if V.shape[1] != 3:
+        return np.asarray(np.linalg.det(V))
+    return np.asarray(np.einsum("mi,mi->m", V[:, 0], np.cross(V[:, 1], V[:, 2])))
