@@ -193,7 +193,14 @@ def test_model_that_fails_half_way_leaves_the_old_one(tmp_path, monkeypatch) -> 
     def interrupted(*args: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("epigauge.io._colmap_pinhole._points", interrupted)
+    monkeypatch.setattr("epigauge.io._colmap_text._point_lines", interrupted)
     with pytest.raises(KeyboardInterrupt):
         save_colmap_model(tmp_path, dataclasses.replace(MODEL, t=2.0 * MODEL.t), SCENE.tracks)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_folder_with_a_binary_model_is_refused(tmp_path) -> None:
+    (tmp_path / "cameras.bin").write_bytes(b"old")
+    with pytest.raises(ArgumentError, match="cameras.bin of another model"):
+        save_colmap_model(tmp_path, MODEL, SCENE.tracks)
+    assert [path.name for path in tmp_path.iterdir()] == ["cameras.bin"]

@@ -1,22 +1,19 @@
-"""COLMAP's text models: cameras.txt, images.txt and points3D.txt in a directory.
-
-COLMAP's pixels have their origin in the left top corner of the image, y down; lengths of images
-are whole numbers above 0. The format is documented at https://colmap.github.io/format.html.
-"""
+"""COLMAP models of pinhole cameras near projective ones."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from epigauge.errors import ArgumentError
+from epigauge.io._colmap_folder import write_folder
+from epigauge.io._colmap_parts import CameraRow, ColmapModel, ImageRow, PointTable
+from epigauge.io._colmap_rigs import rigs_and_frames
+from epigauge.io._colmap_scene import GREY, places
 from epigauge.io._common import PathLike
-from epigauge.io.output import writing
 from epigauge.multi_view.tracks import Tracks
 from epigauge.rotations import quaternion
 
@@ -24,11 +21,6 @@ if TYPE_CHECKING:
     from epigauge.multi_view.pinhole import PinholeModel
 
 __all__ = ["save_colmap_model"]
-
-Array = NDArray[np.float64]
-
-_NAMES = ("cameras.txt", "images.txt", "points3D.txt")
-_GREY = "128 128 128"
 
 
 def save_colmap_model(
@@ -48,8 +40,8 @@ def save_colmap_model(
     Parameters
     ----------
     directory : str or path
-        Where to; made if absent. The files in it are replaced, all three or none of them unless
-        the machine stops between the last steps.
+        Where to; made if absent. The files of a text model in it are replaced, all or none of them
+        unless the machine stops between the last steps.
     model : PinholeModel
         What `pinhole_model` returned for these tracks.
     tracks : Tracks
@@ -60,7 +52,8 @@ def save_colmap_model(
     Raises
     ------
     ArgumentError
-        If the names are not one a view, all different, without white space.
+        If the names are not one a view, all different, without white space; if the directory holds
+        a binary model.
     OSError
         If the files cannot be written.
     """
@@ -71,82 +64,38 @@ def save_colmap_model(
             "names", f"are {names!r:.60}", f"{tracks.n_views} different ones without white space"
         )
     head = (
-        "# Written by epigauge from a projective reconstruction, in a basis that makes its cameras",
-        "# plausible: no calibration, and no unit of length. Leaving out their skew has raised the",
-        f"# RMS residual coordinate from {model.projective_rms_px:.6g} to {model.rms_px:.6g} px.",
+        "Written by epigauge from a projective reconstruction, in a basis that makes its cameras",
+        "plausible: no calibration, and no unit of length. Leaving out their skew has raised the",
+        f"RMS residual coordinate from {model.projective_rms_px:.6g} to {model.rms_px:.6g} px.",
     )
+    content = rigs_and_frames(_model(model, tracks, names), None)
+    write_folder(Path(directory), content, True, head)
+
+
+def _model(model: PinholeModel, tracks: Tracks, names: Sequence[str]) -> ColmapModel:
     # Pixels counted from the middle of the image become those of an image that holds them.
     shift = -np.minimum(np.floor(model.xy.min(axis=0)), 0.0)
-    size = np.maximum(np.ceil((model.xy + shift).max(axis=0)), 1.0).astype(int)
+    xy = model.xy + shift
+    width, height = np.maximum(np.ceil(xy.max(axis=0)), 1.0).astype(int).tolist()
     kept = np.flatnonzero(model.ahead[tracks.point])
-    place = _places(tracks.view[kept], tracks.n_views)
-    contents = (
-        _cameras(model, shift, size),
-        _images(model, tracks, kept, shift, names),
-        _points(model, tracks, kept, place),
-    )
-    target = Path(directory)
-    target.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as stack:
-        files = [stack.enter_context(writing(target / name)) for name in _NAMES]
-        for file, lines in zip(files, contents, strict=True):
-            for line in (*head, *lines):
-                file.write(f"{line}\n".encode())
-
-
-def _cameras(model: PinholeModel, shift: Array, size: NDArray[np.int_]) -> Iterator[str]:
-    yield "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] (fx, fy, cx, cy)"
-    for k, (fx, fy, cx, cy) in enumerate(model.intrinsics):
-        numbers = _text([fx, fy, cx + shift[0], cy + shift[1]])
-        yield f"{k + 1} PINHOLE {size[0]} {size[1]} {numbers}"
-
-
-def _images(
-    model: PinholeModel,
-    tracks: Tracks,
-    kept: NDArray[np.intp],
-    shift: Array,
-    names: Sequence[str],
-) -> Iterator[str]:
-    yield "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"
-    yield "# POINTS2D[] as (X, Y, POINT3D_ID)"
+    view, point = tracks.view[kept], tracks.point[kept]
+    cameras, images = [], []
     for k, name in enumerate(names):
-        pose = _text([*quaternion(model.R[k]), *model.t[k]])
-        yield f"{k + 1} {pose} {k + 1} {name}"
-        rows = kept[tracks.view[kept] == k]
-        yield " ".join(
-            f"{_text(xy)} {point + 1}"
-            for xy, point in zip(model.xy[rows] + shift, tracks.point[rows].tolist(), strict=True)
-        )
-
-
-def _points(
-    model: PinholeModel, tracks: Tracks, kept: NDArray[np.intp], place: NDArray[np.intp]
-) -> Iterator[str]:
-    yield "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"
+        fx, fy, cx, cy = (model.intrinsics[k] + [0.0, 0.0, *shift]).tolist()
+        cameras.append(CameraRow(k + 1, "PINHOLE", width, height, (fx, fy, cx, cy)))
+        pose = quaternion(model.R[k]).tolist(), model.t[k].tolist()
+        own = view == k
+        images.append(ImageRow(k + 1, *pose, k + 1, name, xy[kept[own]], point[own] + 1))
+    # The tracks, and so the rows kept, are sorted by point.
+    ahead = np.flatnonzero(model.ahead)
+    first = np.searchsorted(point, [*ahead, tracks.n_points])
     distances = np.linalg.norm(model.residuals[kept], axis=1)
-    # The tracks, and so the kept rows, are sorted by point.
-    first = np.searchsorted(tracks.point[kept], np.arange(tracks.n_points + 1))
-    for j in np.flatnonzero(model.ahead).tolist():
-        rows = slice(first[j], first[j + 1])
-        track = " ".join(
-            f"{view + 1} {index}"
-            for view, index in zip(
-                tracks.view[kept[rows]].tolist(), place[rows].tolist(), strict=True
-            )
-        )
-        error = float(distances[rows].mean())
-        yield f"{j + 1} {_text(model.points[j])} {_GREY} {error:.6g} {track}"
-
-
-def _places(view: NDArray[np.intp], n_views: int) -> NDArray[np.intp]:
-    """Return for each row its place among those of the same view."""
-    order = np.argsort(view, kind="stable")
-    starts = np.searchsorted(view[order], np.arange(n_views))
-    places = np.empty(len(view), dtype=np.intp)
-    places[order] = np.arange(len(view)) - starts[view[order]]
-    return places
-
-
-def _text(values: Sequence[float] | Array) -> str:
-    return " ".join(f"{float(value):.17g}" for value in values)
+    table = PointTable(
+        ahead + 1,
+        model.points[ahead],
+        np.full((len(ahead), 3), GREY, np.uint8),
+        np.add.reduceat(distances, first[:-1]) / np.diff(first),
+        first,
+        np.column_stack([view + 1, places(view, tracks.n_views)]),
+    )
+    return ColmapModel(cameras, images, table)

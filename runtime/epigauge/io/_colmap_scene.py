@@ -36,7 +36,8 @@ Indices = NDArray[np.int64]
 _RICHER = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 #: What a parameter is called in a richer model.
 _RENAMED = {"f": ("fx", "fy"), "k": ("k1",)}
-_GREY = 128
+#: Of points without a colour.
+GREY = 128
 
 
 def raw_scene(path: Path, model: ColmapModel) -> RawScene:
@@ -272,9 +273,7 @@ def model_of(tracks: Tracks, reconstruction: MetricReconstruction, rigs: str) ->
     table = PointTable(
         point_ids,
         reconstruction.X,
-        np.full((tracks.n_points, 3), _GREY, np.uint8)
-        if tracks.colours is None
-        else tracks.colours,
+        np.full((tracks.n_points, 3), GREY, np.uint8) if tracks.colours is None else tracks.colours,
         _mean_errors(tracks, reconstruction),
         np.searchsorted(tracks.point, np.arange(tracks.n_points + 1)),
         np.column_stack([image_ids[tracks.view], feature_of]),
@@ -338,10 +337,16 @@ def _features(tracks: Tracks, known: ColmapSource | None) -> tuple[list[Array], 
     if known is not None:
         return list(known.features), known.feature_of
     order = np.argsort(tracks.view, kind="stable")
-    ends = _view_ends(tracks)
-    place = np.empty(len(tracks), np.int64)
-    place[order] = np.arange(len(tracks)) - np.concatenate([[0], ends])[tracks.view[order]]
-    return np.split(tracks.xy[order], ends), place
+    return np.split(tracks.xy[order], _view_ends(tracks)), places(tracks.view, tracks.n_views)
+
+
+def places(view: NDArray[np.intp], n_views: int) -> Indices:
+    """Return for each observation its place among those of the same view."""
+    order = np.argsort(view, kind="stable")
+    starts = np.searchsorted(view[order], np.arange(n_views))
+    place = np.empty(len(view), np.int64)
+    place[order] = np.arange(len(view)) - starts[view[order]]
+    return place
 
 
 def _mean_errors(tracks: Tracks, reconstruction: MetricReconstruction) -> Array:

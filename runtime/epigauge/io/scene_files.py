@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +9,11 @@ from numpy.typing import NDArray
 
 from epigauge._arguments import as_choice
 from epigauge.cameras import MetricReconstruction
-from epigauge.errors import ArgumentError, FileFormatError
+from epigauge.errors import ArgumentError
 from epigauge.io._bal import read_bal, write_bal
-from epigauge.io._colmap_binary import read_binary, write_binary
-from epigauge.io._colmap_parts import FILES, ColmapModel
+from epigauge.io._colmap_folder import read_folder, write_folder
+from epigauge.io._colmap_parts import ColmapModel
 from epigauge.io._colmap_scene import model_of, raw_scene
-from epigauge.io._colmap_text import read_text_model, write_text_model
 from epigauge.io._common import PathLike
 from epigauge.io._npz_scene import is_npz_scene, read_npz_scene, write_npz_scene
 from epigauge.io._scene import RawScene, SceneSource, finished
@@ -89,7 +87,7 @@ def load_scene(
     as_choice("repeated", repeated, _REPEATED)
     as_choice("weak", weak, _WEAK)
     if path.is_dir():
-        raw = raw_scene(path, _read_folder(path))
+        raw = raw_scene(path, read_folder(path))
     elif path.suffix.lower() == ".npz":
         raw = read_npz_scene(path)
     elif path.suffix.lower() in _BAL:
@@ -145,7 +143,7 @@ def save_scene(
     if content is None:
         write_npz_scene(path, tracks, reconstruction)
     elif isinstance(content, ColmapModel):
-        _write_folder(path, content, text)
+        write_folder(path, content, text)
     else:
         with writing(path) as file, compressing(file, path.suffix.lower()) as stream:
             write_bal(stream, tracks, content, reconstruction.X)
@@ -185,29 +183,6 @@ def is_scene(path: Path) -> bool:
 
 def _listed() -> str:
     return " or ".join(_BAL)
-
-
-def _read_folder(path: Path) -> ColmapModel:
-    if (path / "cameras.bin").exists():  # as COLMAP chooses
-        return read_binary(path)
-    if (path / "cameras.txt").exists():
-        return read_text_model(path)
-    raise FileFormatError(path, "is no COLMAP model: it holds neither cameras.bin nor cameras.txt")
-
-
-def _write_folder(path: Path, model: ColmapModel, text: bool) -> None:
-    suffix, other = (".txt", ".bin") if text else (".bin", ".txt")
-    stale = path / f"cameras{other}"
-    if stale.exists():
-        was = f"is {str(path)!r}, which holds {stale.name} of another model"
-        raise ArgumentError("path", was, f"an empty folder, or text={not text}")
-    path.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as stack:
-        files = {name: stack.enter_context(writing(path / (name + suffix))) for name in FILES}
-        if text:
-            write_text_model(files, model)
-        else:
-            write_binary(files, model)
 
 
 def _read_bal(path: Path) -> RawScene:
