@@ -42,7 +42,8 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge.multi_view.affine_start import initialize_affine
     from epigauge.multi_view.compare import Comparison, compare
     from epigauge.multi_view.initialize import initialize
-    from epigauge.multi_view.tracks import Reconstruction, Tracks
+    from epigauge.multi_view.reconstruction import Reconstruction
+    from epigauge.multi_view.tracks import Tracks
     from epigauge.multi_view.uncertainty import ReconstructionCovariance, covariance
     from epigauge.scenes import MultiViewScene, TwoViewScene, multi_view_scene, two_view_scene
     from epigauge.two_view.batch import BATCH_STATUS, FundamentalBatch, refine_fundamental_batch
@@ -148,7 +149,8 @@ _WHERE = {
     "multi_view.affine_start": "initialize_affine",
     "multi_view.compare": "Comparison compare",
     "multi_view.initialize": "initialize",
-    "multi_view.tracks": "Reconstruction Tracks",
+    "multi_view.reconstruction": "Reconstruction",
+    "multi_view.tracks": "Tracks",
     "multi_view.uncertainty": "ReconstructionCovariance covariance",
     "scenes": "MultiViewScene TwoViewScene multi_view_scene two_view_scene",
     "two_view.batch": "BATCH_STATUS FundamentalBatch refine_fundamental_batch",

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from epigauge._arguments import as_choice, as_count, as_positive
 from epigauge.errors import ArgumentError
-from epigauge.multi_view.tracks import MIN_POINTS, MIN_VIEWS, Reconstruction, Tracks
+from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.tracks import MIN_POINTS, MIN_VIEWS, Tracks
 
 __all__ = ["MultiViewScene", "TwoViewScene", "multi_view_scene", "two_view_scene"]
 

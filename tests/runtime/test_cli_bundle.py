@@ -133,7 +133,7 @@ def test_several_files_are_written_in_one_run(run, file, tmp_path) -> None:
     assert "by pinhole cameras" in err
     assert "no calibration" in " ".join(err.split())
     images = (tmp_path / "model" / "images.txt").read_text().splitlines()
-    assert images[5].endswith(" 1 view0000")
+    assert images[4].endswith(" 1 view0000")
 
 
 def test_reconstruction_like_no_pinhole_cameras_is_refused_after_all_else(

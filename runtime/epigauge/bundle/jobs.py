@@ -14,6 +14,7 @@ from epigauge.bundle.priors import Prior, Priors, listed_priors
 from epigauge.bundle.refinement import fixed_indices, refined_freedom, whole_freedom
 from epigauge.cameras import (
     AffineReconstruction,
+    AnyReconstruction,
     CameraModel,
     Cameras,
     MetricReconstruction,
@@ -21,14 +22,13 @@ from epigauge.cameras import (
 )
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.frame import Frame
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.tracks import Tracks
 
-__all__ = ["AnyReconstruction", "Job", "job_of", "metric_job"]
+__all__ = ["Job", "job_of", "metric_job"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-
-AnyReconstruction = Reconstruction | MetricReconstruction | AffineReconstruction
 
 #: Numbers of (R | t) before the intrinsics of a camera.
 _POSE = 12

@@ -4,11 +4,13 @@ from epigauge.cameras.affine import AffineReconstruction
 from epigauge.cameras.intrinsics import MAX_FOCAL, MIN_FOCAL, Cameras, check_parameters
 from epigauge.cameras.metric import MetricReconstruction
 from epigauge.cameras.models import CameraModel, camera_model, models
+from epigauge.multi_view.reconstruction import Reconstruction
 
 __all__ = [
     "MAX_FOCAL",
     "MIN_FOCAL",
     "AffineReconstruction",
+    "AnyReconstruction",
     "CameraModel",
     "Cameras",
     "MetricReconstruction",
@@ -16,3 +18,5 @@ __all__ = [
     "check_parameters",
     "models",
 ]
+
+AnyReconstruction = Reconstruction | MetricReconstruction | AffineReconstruction

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._arguments import as_real
-from epigauge._results import Result
 from epigauge.cameras.checks import counted, finite_rows, frozen
 from epigauge.errors import ArgumentError
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.reconstruction import Reconstruction, ReconstructionBase
+from epigauge.multi_view.tracks import Tracks
 
 __all__ = ["AffineReconstruction"]
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class AffineReconstruction(Result):
+class AffineReconstruction(ReconstructionBase):
     """Affine cameras and points: shape up to an affine change of space.
 
     Parameters
@@ -95,27 +95,9 @@ class AffineReconstruction(Result):
         ArgumentError
             If the tracks are of other numbers of views or points.
         """
-        if (tracks.n_views, tracks.n_points) != (self.n_views, self.n_points):
-            was = f"are of {tracks.n_views} views and {tracks.n_points} points"
-            raise ArgumentError("tracks", was, f"{self.n_views} and {self.n_points}, as here")
+        self.check_fits(tracks)
         P = self.P[tracks.view, :2]
         return np.asarray(np.einsum("nij,nj->ni", P[:, :, :3], self.X[tracks.point]) + P[:, :, 3])
-
-    def rms_px(self, tracks: Tracks) -> float:
-        """Return the root mean square of the residual coordinates.
-
-        Parameters
-        ----------
-        tracks : Tracks
-            Observations.
-
-        Returns
-        -------
-        float
-            sqrt(sum of squared residual coordinates / (2 N)), in pixels.
-        """
-        with np.errstate(over="ignore"):
-            return float(np.sqrt(np.mean((tracks.xy - self.project(tracks)) ** 2)))
 
     def to_projective(self) -> Reconstruction:
         """Return the scene as projective cameras and points, which project to the same pixels.

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge._results import Result
 from epigauge.cameras.checks import counted, finite_rows, frozen
 from epigauge.cameras.intrinsics import Cameras
 from epigauge.cameras.models import camera_model
 from epigauge.errors import ArgumentError
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.reconstruction import Reconstruction, ReconstructionBase
+from epigauge.multi_view.tracks import Tracks
 
 __all__ = ["MetricReconstruction"]
 
@@ -27,7 +27,7 @@ _BLOCK = 4096
 
 
 @dataclass(frozen=True, eq=False)
-class MetricReconstruction(Result):
+class MetricReconstruction(ReconstructionBase):
     """Calibrated cameras and points: shape without unit of length, place and direction in space.
 
     Parameters
@@ -165,22 +165,6 @@ class MetricReconstruction(Result):
         pixels, depths = self._images(tracks, None)
         return np.ascontiguousarray(pixels.T), depths
 
-    def rms_px(self, tracks: Tracks) -> float:
-        """Return the root mean square of the residual coordinates.
-
-        Parameters
-        ----------
-        tracks : Tracks
-            Observations.
-
-        Returns
-        -------
-        float
-            sqrt(sum of squared residual coordinates / (2 N)), in pixels.
-        """
-        with np.errstate(over="ignore"):
-            return float(np.sqrt(np.mean((tracks.xy - self.project(tracks)) ** 2)))
-
     def to_projective(self) -> Reconstruction:
         """Return the scene as projective cameras and points; distortion has no place there.
 
@@ -194,9 +178,7 @@ class MetricReconstruction(Result):
 
     def _images(self, tracks: Tracks, backend: str | None) -> tuple[Array, Array]:
         """Return pixels (2, N) and depths (N,)."""
-        if (tracks.n_views, tracks.n_points) != (self.n_views, self.n_points):
-            was = f"are of {tracks.n_views} views and {tracks.n_points} points"
-            raise ArgumentError("tracks", was, f"{self.n_views} and {self.n_points}, as here")
+        self.check_fits(tracks)
         project = camera_model(self.cameras.model).kernel("project", backend)
         cameras, points = (np.ascontiguousarray(rows.T) for rows in (self.vectors, self.X))
         pixels, depths = np.empty((2, len(tracks))), np.empty(len(tracks))

@@ -150,7 +150,7 @@ class SceneJob:
         if json:
             write_json(answer.document())
         else:
-            for row in result.reconstruction.vectors:
+            for row in answer.scene.vectors:
                 typer.echo(" ".join(f"{value:.17g}" for value in row))
             answer.report(out, watch.interrupted)
         if watch.interrupted:
@@ -187,11 +187,13 @@ class _SceneAnswer:
 
     def __init__(self, job: SceneJob, result: eg.BundleResult, seconds: float) -> None:
         self.job, self.result, self.seconds = job, result, seconds
+        assert isinstance(result.reconstruction, eg.MetricReconstruction)
+        self.scene = result.reconstruction
 
     @cached_property
     def frame(self) -> Display:
         """Where to look at it."""
-        return display(self.result.reconstruction, self.job.tracks, y_up=self.job.y_up)
+        return display(self.scene, self.job.tracks, y_up=self.job.y_up)
 
     def more(self) -> dict[str, Any]:
         """Return what neither result nor scene holds."""
@@ -213,7 +215,7 @@ class _SceneAnswer:
 
     def save(self, path: Path) -> None:
         """Write the scene with the result, a cloud of points and centres, or residuals."""
-        tracks, scene = self.job.tracks, self.result.reconstruction
+        tracks, scene = self.job.tracks, self.scene
         match path.suffix.lower():
             case ".ply":
                 note = "points, cameras orange"
@@ -240,7 +242,7 @@ class _SceneAnswer:
 
     def report(self, out: Console, interrupted: bool) -> None:
         """Tell people on stderr what came out."""
-        result, tracks, cameras = self.result, self.job.tracks, self.result.reconstruction.cameras
+        result, tracks, cameras = self.result, self.job.tracks, self.scene.cameras
         refine = self.job.refine
         rows = {
             "scene": f"{tracks.n_views} views, {tracks.n_points} points, "

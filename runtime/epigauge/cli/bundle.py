@@ -324,9 +324,10 @@ class _Answer:
 
     def save_colmap(self, directory: Path) -> ArgumentError | None:
         """Write a text model, the views called as in the file of tracks, or return why not."""
-        tracks = self.file.tracks
+        tracks, found = self.file.tracks, self.result.reconstruction
+        assert isinstance(found, eg.Reconstruction)
         try:
-            self.model = pinhole_model(self.result.reconstruction, tracks, frame=self.frame)
+            self.model = pinhole_model(found, tracks, frame=self.frame)
         except ArgumentError as error:
             return error
         names = [f"view{number:04d}" for number in self.file.views.tolist()]

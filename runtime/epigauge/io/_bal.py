@@ -19,7 +19,8 @@ from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._common import MAX_MATCHES
 from epigauge.io._npz import damage
 from epigauge.io._text import numbers, text_lines
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.tracks import Tracks
 from epigauge.rotations import from_rodrigues, rodrigues
 
 Array = NDArray[np.float64]

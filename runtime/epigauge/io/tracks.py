@@ -20,7 +20,8 @@ from epigauge.io._npz import read_npz, write_npz
 from epigauge.io._text import Columns, read_text
 from epigauge.io.output import writing
 from epigauge.multi_view.labels import view_names
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.tracks import Tracks
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -17,13 +17,13 @@ from epigauge._options import Backend, BundleDamping, GaugeMode, Method, Schedul
 from epigauge._options import Loss as LossName
 from epigauge._results import Result
 from epigauge.bundle.dampings import DAMPINGS
-from epigauge.bundle.jobs import AnyReconstruction, job_of
+from epigauge.bundle.jobs import job_of
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.priors import Prior, listed_priors
 from epigauge.bundle.refinement import fixed_indices
 from epigauge.bundle.run import checked_gauge, minimized
 from epigauge.bundle.strategies import STRATEGIES
-from epigauge.cameras import AffineReconstruction, MetricReconstruction
+from epigauge.cameras import AffineReconstruction, AnyReconstruction, MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.gauge import Gauge
 from epigauge.multi_view.initialize import initialize
@@ -102,7 +102,7 @@ class BundleResult(Result):
         *("nfev", "message"),
     )
 
-    reconstruction: Any = field(repr=False)
+    reconstruction: AnyReconstruction = field(repr=False)
     rms_px: float
     cost: float
     fun: Array = field(repr=False)

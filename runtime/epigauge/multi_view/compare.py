@@ -17,7 +17,8 @@ from epigauge.cameras import MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.adjust import bundle_adjust
 from epigauge.multi_view.initialize import initialize
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.tracks import Tracks
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

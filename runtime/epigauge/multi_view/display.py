@@ -18,11 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.cameras import MetricReconstruction
+from epigauge.cameras import AffineReconstruction, AnyReconstruction, MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.gauge import normalized
 from epigauge.multi_view.plausible import camera_deviations, depth_signs, plausible_basis
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.tracks import Tracks
 
 __all__ = ["Display", "camera_spacing", "display", "is_sequence"]
 
@@ -77,9 +77,7 @@ class Display:
         return self.deviation > _DISTORTED
 
 
-def display(
-    reconstruction: Reconstruction | MetricReconstruction, tracks: Tracks, *, y_up: bool = False
-) -> Display:
+def display(reconstruction: AnyReconstruction, tracks: Tracks, *, y_up: bool = False) -> Display:
     """Choose a basis in which a reconstruction looks plausible and is not mirrored.
 
     Parameters
@@ -100,13 +98,17 @@ def display(
     Raises
     ------
     ArgumentError
-        If the cameras or points are too degenerate.
+        If the cameras or points are too degenerate, or the cameras affine.
 
     Notes
     -----
     Where the views are nearly affine (a small scene far away) many bases are as plausible: the one
     chosen may stretch the scene in depth.
     """
+    if isinstance(reconstruction, AffineReconstruction):
+        was = "has affine cameras, which have no centres to show"
+        needed = "eg.bundle_adjust(tracks, reconstruction.to_projective()).reconstruction"
+        raise ArgumentError("reconstruction", was, needed)
     low, high = tracks.xy.min(axis=0), tracks.xy.max(axis=0)
     unit = float(np.sum(high - low))
     to_pixels = np.diag([unit, -unit if y_up else unit, 1.0])

@@ -21,8 +21,9 @@ from epigauge.kernels import Table, table
 from epigauge.multi_view.factorization import factorized
 from epigauge.multi_view.first_pair import TooFewInCommon
 from epigauge.multi_view.frame import Frame
+from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.registration import registered
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.tracks import Tracks
 from epigauge.two_view.losses import EFFICIENT, Loss, median, robust_scale
 
 __all__ = ["initialize"]

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.display import Display, display
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.tracks import Tracks
 
 __all__ = ["PinholeModel", "pinhole_model"]
 

@@ -27,8 +27,9 @@ from epigauge.multi_view.first_pair import (
     rows_of,
 )
 from epigauge.multi_view.frame import Frame, counted
+from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.resection import resect
-from epigauge.multi_view.tracks import MIN_POINTS, MIN_VIEWS, Reconstruction, Tracks
+from epigauge.multi_view.tracks import MIN_POINTS, MIN_VIEWS, Tracks
 from epigauge.scatter import spread
 from epigauge.two_view.geometry import canonical_cameras
 from epigauge.two_view.losses import EFFICIENT, Loss, robust_scale

@@ -18,7 +18,8 @@ from epigauge.kernels import Table
 from epigauge.multi_view.agreement import agreed_points
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import normalized
-from epigauge.multi_view.tracks import MIN_VIEWS, Reconstruction, Tracks
+from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.tracks import MIN_VIEWS, Tracks
 from epigauge.two_view.losses import EFFICIENT, median
 
 if TYPE_CHECKING:
@@ -184,10 +185,11 @@ class _Search:
 
     def restored(self, found: BundleResult, before: Any, rejected: Mask) -> BundleResult:
         """Return the result with such points where they were before."""
-        if not isinstance(before, Reconstruction):
+        after = found.reconstruction
+        if not (isinstance(before, Reconstruction) and isinstance(after, Reconstruction)):
             return found
-        Q = np.where(self.lost(rejected)[:, None], before.Q, found.reconstruction.Q)
-        reconstruction = Reconstruction(found.reconstruction.P, Q)
+        Q = np.where(self.lost(rejected)[:, None], before.Q, after.Q)
+        reconstruction = Reconstruction(after.P, Q)
         fun = self.tracks.xy - reconstruction.project(self.tracks)
         return replace(found, reconstruction=reconstruction, fun=fun)
 

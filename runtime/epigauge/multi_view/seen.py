@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.multi_view.tracks import MIN_VIEWS, Reconstruction, Tracks
+from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.tracks import MIN_VIEWS, Tracks
 
 __all__ = ["Seen"]
 

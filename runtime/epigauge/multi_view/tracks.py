@@ -1,10 +1,9 @@
-"""Measured image points of many views, checked once, and reconstructions of them."""
+"""Measured image points of many views, checked once."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,16 +18,13 @@ from epigauge.multi_view.measured import measured, merged_sums
 if TYPE_CHECKING:
     from epigauge.io._common import PathLike
 
-__all__ = ["Reconstruction", "Tracks"]
+__all__ = ["Tracks"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 #: A view needs this many points, a point this many views, for its parameters to be determined.
 MIN_POINTS, MIN_VIEWS = 6, 2
-
-#: Size of a camera or a point, its largest entry: products of others overflow.
-MIN_SIZE, MAX_SIZE = 1e-100, 1e100
 
 
 class Tracks(Result):
@@ -376,84 +372,6 @@ def _nearest(
     kept = keep.copy()
     kept[rows] = new
     return kept
-
-
-@dataclass(frozen=True)
-class Reconstruction(Result):
-    """Cameras and points up to a projective change of basis; scales are free too.
-
-    Attributes
-    ----------
-    P : ndarray, shape (n, 3, 4)
-        Cameras, to pixels.
-    Q : ndarray, shape (m, 4)
-        Homogeneous points.
-    """
-
-    P: Array
-    Q: Array
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "P", _homogeneous("P", self.P, (3, 4)))
-        object.__setattr__(self, "Q", _homogeneous("Q", self.Q, (4,)))
-
-    def _heading(self) -> str:
-        return f"Reconstruction: {len(self.P)} views, {len(self.Q)} points"
-
-    def _summary_rows(self) -> dict[str, str]:
-        return {"cameras": "projective, known up to a change of basis"}
-
-    def project(self, tracks: Tracks) -> Array:
-        """Return the predicted pixels of all observations.
-
-        Parameters
-        ----------
-        tracks : Tracks
-            Which point is seen in which view.
-
-        Returns
-        -------
-        ndarray, shape (N, 2)
-            In the tracks' order; infinite or NaN for points in a camera's focal plane.
-        """
-        h = np.einsum("nij,nj->ni", self.P[tracks.view], self.Q[tracks.point])
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            return np.asarray(h[:, :2] / h[:, 2:])
-
-    def rms_px(self, tracks: Tracks) -> float:
-        """Return the root mean square of the residual coordinates.
-
-        Parameters
-        ----------
-        tracks : Tracks
-            Observations.
-
-        Returns
-        -------
-        float
-            sqrt(sum of squared residual coordinates / (2 N)), in pixels, of the N observations
-            whose weight is not zero.
-        """
-        counts = tracks.weights > 0.0
-        with np.errstate(over="ignore"):
-            return float(np.sqrt(np.mean((tracks.xy - self.project(tracks))[counts] ** 2)))
-
-
-def _homogeneous(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return homogeneous matrices or vectors, of any scale but zero."""
-    array = as_array(name, value, "a regular array")
-    if array.dtype.kind not in "iuf" or array.shape[1:] != shape or array.ndim == 0:
-        needed = ", ".join(map(str, shape))
-        raise ArgumentError(name, f"is {array.dtype} {array.shape}", f"real numbers, (n, {needed})")
-    array = np.ascontiguousarray(as_double(array))
-    size = np.abs(array).max(axis=tuple(range(1, array.ndim)))
-    bad = np.flatnonzero(~((size >= MIN_SIZE) & (size <= MAX_SIZE)))
-    if len(bad):
-        row = bad[0]
-        what = f"of size {size[row]:g}" if np.isfinite(size[row]) else "not finite"
-        needed = f"a largest entry between {MIN_SIZE:g} and {MAX_SIZE:g}"
-        raise ArgumentError(name, f"is {what} in row {row}", needed)
-    return array
 
 
 def _indices(name: str, value: ArrayLike) -> Indices:

@@ -31,8 +31,9 @@ from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import Gauge, identity, normalized, two_cameras
 from epigauge.multi_view.inverse import Inverse
 from epigauge.multi_view.measured import whitened
+from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.sandwich import Sandwich
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.tracks import Tracks
 from epigauge.two_view.losses import LOSSES, Loss
 from epigauge.uncertainty.covariance import MetricCovariance
 from epigauge.uncertainty.influence import Influence, RobustFit

@@ -6,6 +6,7 @@ import numpy as np
 
 from epigauge.multi_view.adjust import BundleResult
 from epigauge.multi_view.gauge import equivalent
+from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.reproduce.gauge_runs import (
     LABELS,
     STEPS,
@@ -29,6 +30,7 @@ def bases(study: GaugeStudy) -> Section:
     rows = []
     invariant = {}
     for method, label in study.track(list(LABELS.items()), "random bases"):
+        own = here[method].reconstruction
         cells: list[str | float] = [label, float(here[method].nit)]
         alike = True
         for condition in CONDITIONS:
@@ -38,7 +40,10 @@ def bases(study: GaugeStudy) -> Section:
                 there = random_transformation(random, condition, tracks.n_views, tracks.n_points)
                 result = study.adjust(tracks, moved(start, there), method)
                 counts.append(result.nit)
-                same += equivalent(result.reconstruction, here[method].reconstruction, 1e-6)
+                found = result.reconstruction
+                assert isinstance(own, Reconstruction)
+                assert isinstance(found, Reconstruction)
+                same += equivalent(found, own, 1e-6)
                 alike &= _same_course(result, here[method])
             cells.append(f"{min(counts)} to {max(counts)} ({same}/{_BASES})")
         invariant[method] = alike

@@ -20,7 +20,8 @@ from epigauge.multi_view.adjust import BundleResult, bundle_adjust
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import Gauge, Transformation, identity, normalized
 from epigauge.multi_view.initialize import initialize
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.tracks import Tracks
 from epigauge.reproduce.common import Track, tracked
 from epigauge.scenes import multi_view_scene
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.initialize import initialize
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.tracks import Tracks
 from epigauge.reproduce.gauge_runs import LABELS, GaugeStudy, lowest, perturbed
 from epigauge.reproduce.report import Claim, Section, Table, lower
 from epigauge.scenes import multi_view_scene

@@ -13,7 +13,8 @@ from epigauge.cameras import camera_model
 from epigauge.multi_view.adjust import BundleResult
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.initialize import initialize
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.tracks import Tracks
 from epigauge.reproduce.gauge_runs import LABELS, GaugeStudy, perturbed
 from epigauge.reproduce.report import Claim, Section, Table
 

@@ -102,6 +102,7 @@ def network(study: MetrologyStudy) -> Section:
     file, tracks, start, bar = load_network(path)
     free = tuple(file["camera_names"].tolist())
     result = bundle_adjust(tracks, start, refine=free, priors=[bar], ftol=1e-10)
+    assert isinstance(result.reconstruction, MetricReconstruction)
     cov = covariance(
         tracks,
         aligned(result.reconstruction, file["own_points"], scaled=False),
@@ -212,6 +213,7 @@ def coverage(study: MetrologyStudy) -> Section:
         for trial in range(study.trials):
             tracks, truth = simulated(model, study.seed + trial)
             found = bundle_adjust(tracks, truth, refine=free).reconstruction
+            assert isinstance(found, MetricReconstruction)
             for name, datum in datums.items():
                 moved = _moved_to(datum, found, truth)
                 there = covariance(tracks, moved, datum, _NOISE, refine=free)

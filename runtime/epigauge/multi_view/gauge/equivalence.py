@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from epigauge.multi_view.gauge.gauges import normalized
 from epigauge.multi_view.gauge.transformations import Transformation
-from epigauge.multi_view.tracks import Reconstruction
+from epigauge.multi_view.reconstruction import Reconstruction
 
 __all__ = ["equivalent"]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from epigauge.cameras import AffineReconstruction, MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
-from epigauge.multi_view.tracks import Reconstruction
+from epigauge.multi_view.reconstruction import Reconstruction
 
 __all__ = ["Group", "group"]
 

@@ -13,7 +13,7 @@ from epigauge._arguments import as_real
 from epigauge.bundle.similarity import Similarity
 from epigauge.cameras import AffineReconstruction, MetricReconstruction
 from epigauge.errors import ArgumentError
-from epigauge.multi_view.tracks import Reconstruction
+from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.rotations import as_rotation
 
 __all__ = ["Gauge", "Transformation", "similarity", "transform"]

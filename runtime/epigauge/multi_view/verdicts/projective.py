@@ -9,8 +9,9 @@ from epigauge.bundle.solve import BundleSystem
 from epigauge.kernels import Table
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.parallax import parallax_flags
+from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.seen import Seen
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.tracks import Tracks
 from epigauge.multi_view.verdicts.counting import (
     CAMERA,
     GAUGE,

@@ -1,0 +1,167 @@
+"""What every reconstruction of tracks can do, and the projective one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge._arguments import as_array, as_double
+from epigauge._results import Result
+from epigauge.errors import ArgumentError
+from epigauge.multi_view.tracks import Tracks
+
+__all__ = ["Reconstruction", "ReconstructionBase"]
+
+Array = NDArray[np.float64]
+
+#: Size of a camera or a point, its largest entry: products of others overflow.
+MIN_SIZE, MAX_SIZE = 1e-100, 1e100
+
+
+class ReconstructionBase(Result):
+    """Cameras and points of any kind."""
+
+    __slots__ = ()
+
+    @property
+    def n_views(self) -> int:
+        """Number of views."""
+        raise NotImplementedError
+
+    @property
+    def n_points(self) -> int:
+        """Number of points."""
+        raise NotImplementedError
+
+    def project(self, tracks: Tracks) -> Array:
+        """Return the predicted pixels of all observations.
+
+        Parameters
+        ----------
+        tracks : Tracks
+            Which point is seen in which view.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            In the tracks' order; infinite or NaN where the camera has no image of a point.
+
+        Raises
+        ------
+        ArgumentError
+            If the tracks are of other numbers of views or points.
+        """
+        raise NotImplementedError
+
+    def rms_px(self, tracks: Tracks) -> float:
+        """Return the root mean square of the residual coordinates.
+
+        Parameters
+        ----------
+        tracks : Tracks
+            Observations.
+
+        Returns
+        -------
+        float
+            sqrt(sum of squared residual coordinates / (2 N)), in pixels, of the N observations
+            whose weight is not zero.
+        """
+        counts = tracks.weights > 0.0
+        with np.errstate(over="ignore"):
+            return float(np.sqrt(np.mean((tracks.xy - self.project(tracks))[counts] ** 2)))
+
+    def check_fits(self, tracks: Tracks) -> None:
+        """Refuse tracks of other numbers of views or points.
+
+        Parameters
+        ----------
+        tracks : Tracks
+            Observations.
+
+        Raises
+        ------
+        ArgumentError
+            If they are of others.
+        """
+        if (tracks.n_views, tracks.n_points) != (self.n_views, self.n_points):
+            was = f"are of {tracks.n_views} views and {tracks.n_points} points"
+            raise ArgumentError("tracks", was, f"{self.n_views} and {self.n_points}, as here")
+
+
+@dataclass(frozen=True)
+class Reconstruction(ReconstructionBase):
+    """Cameras and points up to a projective change of basis; scales are free too.
+
+    Attributes
+    ----------
+    P : ndarray, shape (n, 3, 4)
+        Cameras, to pixels.
+    Q : ndarray, shape (m, 4)
+        Homogeneous points.
+    """
+
+    P: Array
+    Q: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "P", _homogeneous("P", self.P, (3, 4)))
+        object.__setattr__(self, "Q", _homogeneous("Q", self.Q, (4,)))
+
+    @property
+    def n_views(self) -> int:
+        """Number of views."""
+        return len(self.P)
+
+    @property
+    def n_points(self) -> int:
+        """Number of points."""
+        return len(self.Q)
+
+    def _heading(self) -> str:
+        return f"Reconstruction: {len(self.P)} views, {len(self.Q)} points"
+
+    def _summary_rows(self) -> dict[str, str]:
+        return {"cameras": "projective, known up to a change of basis"}
+
+    def project(self, tracks: Tracks) -> Array:
+        """Return the predicted pixels of all observations.
+
+        Parameters
+        ----------
+        tracks : Tracks
+            Which point is seen in which view.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            In the tracks' order; infinite or NaN for points in a camera's focal plane.
+
+        Raises
+        ------
+        ArgumentError
+            If the tracks are of other numbers of views or points.
+        """
+        self.check_fits(tracks)
+        h = np.einsum("nij,nj->ni", self.P[tracks.view], self.Q[tracks.point])
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            return np.asarray(h[:, :2] / h[:, 2:])
+
+
+def _homogeneous(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Return homogeneous matrices or vectors, of any scale but zero."""
+    array = as_array(name, value, "a regular array")
+    if array.dtype.kind not in "iuf" or array.shape[1:] != shape or array.ndim == 0:
+        needed = ", ".join(map(str, shape))
+        raise ArgumentError(name, f"is {array.dtype} {array.shape}", f"real numbers, (n, {needed})")
+    array = np.ascontiguousarray(as_double(array))
+    size = np.abs(array).max(axis=tuple(range(1, array.ndim)))
+    bad = np.flatnonzero(~((size >= MIN_SIZE) & (size <= MAX_SIZE)))
+    if len(bad):
+        row = bad[0]
+        what = f"of size {size[row]:g}" if np.isfinite(size[row]) else "not finite"
+        needed = f"a largest entry between {MIN_SIZE:g} and {MAX_SIZE:g}"
+        raise ArgumentError(name, f"is {what} in row {row}", needed)
+    return array
