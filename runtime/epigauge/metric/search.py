@@ -16,7 +16,8 @@ from epigauge.metric.samples import Sample
 from epigauge.metric.scene import Images, metric_scene
 from epigauge.multi_view.adjust import BundleResult, bundle_adjust
 from epigauge.multi_view.initialize import initialize
-from epigauge.multi_view.tracks import Reconstruction, Tracks
+from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.tracks import Tracks
 from epigauge.multi_view.uncertainty import covariance
 from epigauge.two_view.losses import median
 
@@ -166,6 +167,7 @@ class Search:
         typical = median(distances)
         kept = tracks.weighted(np.where(distances > 6.0 * typical, 0.0, tracks.weights))
         images, found = self.images, projective.reconstruction
+        assert isinstance(found, Reconstruction)
         views = Views(images.cameras_in(found.P), images.group, kernels.table(self.backend))
         tried: list[tuple[float, Candidate, MetricReconstruction]] = []
         for basis in metric_bases(views)[:_CANDIDATES]:

@@ -18,7 +18,8 @@ from epigauge.metric.samples import sampled
 from epigauge.metric.scene import Images, with_all_points
 from epigauge.metric.search import MODELS, Candidate, Fit, Search
 from epigauge.multi_view.adjust import BundleResult, bundle_adjust
-from epigauge.multi_view.tracks import MIN_VIEWS, Reconstruction, Tracks
+from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.tracks import MIN_VIEWS, Tracks
 from epigauge.multi_view.uncertainty import covariance
 from epigauge.uncertainty.covariance import MetricCovariance
 from epigauge.verdicts import FLAGS, ordered, usable
@@ -222,7 +223,8 @@ def _judged(
     backend: str | None,
 ) -> MetricUpgrade:
     """Return the result of an adjustment, with standard deviations and flags."""
-    found: MetricReconstruction = bundle.reconstruction
+    found = bundle.reconstruction
+    assert isinstance(found, MetricReconstruction)
     focal, known = _focal_lengths(found), None
     weights = np.where(bundle.rejected, 0.0, tracks.weights)
     flags, turn_std = set(bundle.flags), 0.0
