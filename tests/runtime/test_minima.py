@@ -6,7 +6,7 @@ import epigauge as eg
 import numpy as np
 import pytest
 from epigauge.kernels import table
-from epigauge.two_view.evidence import is_oriented
+from epigauge.two_view.evidence import oriented_matches
 from epigauge.two_view.minima import perturbed
 from epigauge.two_view.solve import Matches
 from two_views import up_to_sign
@@ -177,7 +177,7 @@ class TestOriented:
         for motion in ("sideways", "forward"):
             view = eg.two_view_scene(5.0, motion=motion, seed=2)
             for F in (view.F_true, -view.F_true):
-                assert is_oriented(F, view.x1_true.T, view.x2_true.T, 0.01)
+                assert oriented_matches(F, view.x1_true.T, view.x2_true.T, 0.01).all()
 
     def test_a_point_behind_one_camera_is_not(self) -> None:
         view = eg.two_view_scene(5.0, seed=2)
@@ -189,12 +189,12 @@ class TestOriented:
         assert min(depths) < 0 < max(depths)
         h1, h2 = X @ view.P1.T, X @ view.P2.T
         q1, q2 = (h1[:, :2] / h1[:, 2:]).T, (h2[:, :2] / h2[:, 2:]).T
-        assert not is_oriented(view.F_true, q1, q2, 0.01)
+        assert not oriented_matches(view.F_true, q1, q2, 0.01).all()
 
     def test_a_point_within_the_noise_of_an_epipole_has_no_say(self) -> None:
         view = eg.two_view_scene(5.0, motion="forward", seed=2)
         q1, q2 = view.x1_true.T.copy(), view.x2_true.T.copy()
         # Both epipoles are at the origin; a match across it in one image only
         q1[:, 0], q2[:, 0] = [1.0, 1.0], [-1.2, -1.2]
-        assert not is_oriented(view.F_true, q1, q2, 0.1)
-        assert is_oriented(view.F_true, q1, q2, 0.6)
+        assert not oriented_matches(view.F_true, q1, q2, 0.1).all()
+        assert oriented_matches(view.F_true, q1, q2, 0.6).all()

@@ -12,7 +12,7 @@ from epigauge import kernels
 from epigauge.errors import MissingPackageError
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.consensus import Consensus
-from epigauge.two_view.planes import _by_chance
+from epigauge.two_view.planes import chance_pairs
 from two_views import same_geometry
 
 INSTALLED = [
@@ -313,11 +313,54 @@ class TestPlanesWithWrongMatches:
     def test_true_matches_off_the_plane_are_believed(self) -> None:
         assert "planar scene" not in self.flags(self.PLANE, 40, depth=0.1)
 
-    def test_two_wrong_matches_fit_without_any_chance(self) -> None:
-        assert [_by_chance(wrong, 0.0) for wrong in (0, 1, 2, 30)] == [0, 1, 2, 2]
 
-    def test_number_by_chance_grows_with_wrong_matches_and_chance(self) -> None:
-        assert _by_chance(30, 0.005) < _by_chance(300, 0.005) < _by_chance(300, 0.05) < 300
+class TestAgreementByChance:
+    """How many wrong matches agree with an F whose epipole a homography leaves free."""
+
+    def test_any_two_do(self) -> None:
+        nothing = np.zeros(30)
+        assert chance_pairs(nothing, 2) == np.inf
+        assert chance_pairs(nothing, 3) == 0.0
+
+    def test_pairs_are_counted_as_simulated(self) -> None:
+        rng = np.random.default_rng(0)
+        chances = rng.uniform(0.0, 0.6, 12)
+        agreeing = np.sum(rng.random((100_000, 12)) < chances, axis=1)
+        for k in (3, 5, 7, 9):
+            share = np.mean(agreeing >= k - 2)
+            assert chance_pairs(chances, k) / 66.0 == pytest.approx(share, abs=5e-3)
+
+    def test_the_order_of_the_matches_does_not_count(self) -> None:
+        chances = np.random.default_rng(1).uniform(0.0, 0.2, 40)
+        assert chance_pairs(chances[::-1], 9) == pytest.approx(chance_pairs(chances, 9), rel=1e-6)
+
+    @staticmethod
+    def flags(off: int, beside: int = 1, slight: int = 0) -> tuple[str, ...]:
+        """Return what is said of a plane with matches on the lines through one epipole.
+
+        Of `off` places well off the plane, each has `beside` matches side by side; `slight` more
+        matches anywhere are only six deviations off it, whatever the direction.
+        """
+        rng = np.random.default_rng(8)
+        x1 = rng.uniform((20.0, 20.0), (620.0, 460.0), (300, 2))
+        x2 = x1 + 0.03 * (x1 - [320.0, 240.0]) + 1e-4 * x1[:, :1] * x1 + [4.0, -9.0]
+        chosen = np.arange(off * beside)
+        x1[chosen] = x1[chosen // beside] + rng.uniform(-1.0, 1.0, (off * beside, 2))
+        x2[chosen] = x1[chosen] + 0.03 * (x1[chosen] - [320.0, 240.0])
+        x2[chosen] += 1e-4 * x1[chosen, :1] * x1[chosen] + [4.0, -9.0]
+        direction = x2[chosen] - [900.0, 100.0]
+        x2[chosen] += 30.0 * direction / np.linalg.norm(direction, axis=1)[:, None]
+        bend = rng.standard_normal((slight, 2))
+        x2[300 - slight :] += 3.0 * bend / np.linalg.norm(bend, axis=1)[:, None]
+        x1, x2 = (x + 0.35 * rng.standard_normal(x.shape) for x in (x1, x2))
+        return eg.refine_fundamental(x1, x2).flags
+
+    def test_matches_side_by_side_fix_one_line(self) -> None:
+        assert "nearly planar" in self.flags(8)
+        assert "planar scene" in self.flags(2, beside=4)
+
+    def test_matches_slightly_off_agree_easily(self) -> None:
+        assert "planar scene" in self.flags(0, slight=6)
 
 
 @front_end

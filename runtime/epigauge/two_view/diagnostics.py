@@ -86,7 +86,8 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     to no motion at all, and the noise s^2 = S / (n - p), the flags say
 
     - no common geometry: more geometries than `chance.SIGNIFICANT` says would agree so well with
-      wrong matches, with F and with the best other geometry; than one, of few matches;
+      wrong matches, with F and with the best other geometry; than one, of few matches. Matches in
+      front of one camera only do not agree;
     - gross errors: the geometry of highest likelihood under a mixture of right and wrong matches is
       no chance, leaves some far off, and the variance of those near it is less than half of s^2;
     - planar scene: ``S_H / (2 n - 8) <= max(1.5, F99) s^2``, with F99 the 99 % quantile of the
@@ -137,7 +138,7 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     # So few cannot be significant; but no more geometries than one may agree by chance.
     few = raised["few matches"] and not found.searched
     wide = found.noise > WIDE * RANGE
-    if (judged.searched or wide) and not is_common(judged, 0.0 if few else SIGNIFICANT):
+    if (judged.searched or wide or few) and not is_common(judged, 0.0 if few else SIGNIFICANT):
         raised["no common geometry"] = True
     else:
         for name, is_raised in _plane(judged).items():

@@ -14,7 +14,7 @@ from epigauge.two_view.criteria import Reprojection
 from epigauge.two_view.essential import Motion
 from epigauge.two_view.solve import Matches, Options, Solution
 
-__all__ = ["ROUNDING", "WITHIN", "Evidence", "evidence", "is_oriented"]
+__all__ = ["ROUNDING", "WITHIN", "Evidence", "evidence", "oriented_matches"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -107,9 +107,12 @@ class Evidence:
     @cached_property
     def oriented(self) -> bool:
         """Whether F satisfies the oriented epipolar constraint; of E, whether none is behind."""
-        if self.from_rays is not None:
-            return self.n_behind == 0
-        return is_oriented(self.F, *self._corrected[:2], self.noise)
+        return self.n_behind == 0 if self.from_rays is not None else bool(self.in_front.all())
+
+    @cached_property
+    def in_front(self) -> Mask:
+        """Which inliers satisfy the oriented epipolar constraint, as most do, shape (m,)."""
+        return oriented_matches(self.F, *self._corrected[:2], self.noise)
 
     def among(
         self, x1: Array, x2: Array, weights: Array, inlier: Mask, limit_px: float
@@ -183,11 +186,11 @@ def evidence(
     )
 
 
-def is_oriented(F: Array, q1_hat: Array, q2_hat: Array, noise: float) -> bool:
+def oriented_matches(F: Array, q1_hat: Array, q2_hat: Array, noise: float) -> Mask:
     """Test the oriented epipolar constraint on matches that satisfy q2^T F q1 = 0.
 
     Points in front of both cameras have (e' x q') . (F q) of one sign. Matches with a point within
-    three standard deviations of an epipole are left out: noise decides on their sign.
+    three standard deviations of an epipole pass: noise decides on their sign.
 
     Parameters
     ----------
@@ -200,8 +203,8 @@ def is_oriented(F: Array, q1_hat: Array, q2_hat: Array, noise: float) -> bool:
 
     Returns
     -------
-    bool
-        Whether all signs agree.
+    ndarray of bool, shape (n,)
+        Whether a match has the sign that most have.
 
     References
     ----------
@@ -217,5 +220,5 @@ def is_oriented(F: Array, q1_hat: Array, q2_hat: Array, noise: float) -> bool:
     signs = off2[0] * line[1] - off2[1] * line[0] + third * line[2]
     near = WITHIN * noise
     told = (np.hypot(*off1) > near * abs(e1[2])) & (np.hypot(*off2) > near * abs(e2[2]))
-    signs = signs[told]
-    return bool((signs > 0.0).all() or (signs < 0.0).all())
+    majority = 1.0 if np.sum(np.sign(signs[told])) >= 0.0 else -1.0
+    return np.asarray(~told | (majority * signs > 0.0))

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.two_view.chance import chance_agreement
 from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.evidence import ROUNDING, WITHIN, Evidence
 from epigauge.two_view.homography import fit_homography, robust_homography
@@ -28,6 +27,7 @@ __all__ = [
     "SAMPLES",
     "Planes",
     "affine_cost",
+    "chance_pairs",
     "displacement",
     "judge_plane",
     "may_be_rotation",
@@ -61,8 +61,20 @@ HIDDEN = RELIEF / 2.0**0.5
 _NO_RELIEF = 0.001
 _STANDS_OUT = 3.0
 
-#: Wrong matches that the epipole can be put through when all others are in one plane.
+#: A share of so many off the plane is not taken for relief: as many matches are wrong.
+_FEW_FAR = 0.02
+
+#: Wrong matches that the epipole can be put through when all others are in one plane; how many such
+#: pairs may be expected that as many agree with, where the agreement is one by chance; and what is
+#: side by side, as a share of the range.
 _EPIPOLE = 2
+_BY_CHANCE = 0.01
+_BESIDE = 0.01
+
+#: Matches off a plane by no more than so many times the distance of an inlier are its relief where
+#: they are more than this share of the inliers.
+_SLIGHTLY = 5.0
+_FEW_SLIGHT = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,13 +172,14 @@ def judge_plane(found: Evidence, *, hidden: bool) -> Planes:
     far, relief, mean, on = 0, 0.0, 0.0, np.ones(len(found.weights), np.bool_)
     flat = False
     if not hidden:
-        _, squares = robust_homography(found.q1, found.q2, found.weights, found.table)
-        squares = found.weights * squares
+        H, _ = robust_homography(found.q1, found.q2, found.weights, found.table)
+        apart = found.table.homography_squared(H, found.all1, found.all2)
+        squares = found.weights * apart[found.inlier]
         far = int(np.count_nonzero(squares > FAR_OFF**2 * noise2))
         relief = float(np.mean(np.minimum(squares, FAR_OFF**2 * noise2)))
         mean = float(np.mean(squares))
-        flat = _is_flat(found, squares)
-        on = _without_chance(found, squares <= OFF_PLANE**2 * noise2)
+        flat = _is_flat(found, apart)
+        on = _without_chance(found, apart)
     weights = found.weights[on]
     q1, q2 = (np.ascontiguousarray(q[:, on]) for q in (found.q1, found.q2))
     H, squares, normal = fit_homography(q1, q2, weights, found.table)
@@ -189,50 +202,95 @@ def displacement(found: Evidence, q1: Array, q2: Array, weights: Array) -> float
     return float(np.sum(weights * np.sum(moved**2, axis=0))) / 2.0
 
 
-def _without_chance(found: Evidence, on: Mask) -> Mask:
+def _without_chance(found: Evidence, apart: Array) -> Mask:
     """Return which inliers to judge a plane by: without those off it, if these agree by chance.
 
     An F that fits a homography is free to move its epipole, and so to explain two wrong matches
-    more; where it was searched for among wrong matches, some of the others lie by chance on their
-    epipolar lines. A few such matches would hide that all the rest are in one plane.
+    more; some of the others lie by chance on their epipolar lines. A few such matches would hide
+    that all the rest are in one plane.
     """
-    off = len(on) - int(np.count_nonzero(on))
-    return on if _is_accidental(found, off) else np.ones(len(on), np.bool_)
+    off = found.all_weights * apart > (OFF_PLANE * max(found.noise, ROUNDING)) ** 2
+    everywhere = np.ones(len(found.weights), np.bool_)
+    return ~off[found.inlier] if _is_accidental(found, apart, off) else everywhere
 
 
-def _is_accidental(found: Evidence, off: int) -> bool:
-    """Tell whether no more matches are off a plane than agree with F by chance."""
-    if off <= _EPIPOLE:
-        return True
-    if not found.searched:
-        return False
-    chance = chance_agreement(found.table, found.F, found.all1, found.all2, found.limit)
-    return off <= _by_chance(found.rejected + off, chance)
+def _is_flat(found: Evidence, apart: Array) -> bool:
+    """Tell whether all are on the plane by any measure, but for a few.
 
-
-def _is_flat(found: Evidence, squares: Array) -> bool:
-    """Tell whether all are on the plane by any measure, but for those that agree by chance."""
+    A few are a fiftieth beyond the relief that a plane may have, side by side counted once, and any
+    number that agrees by chance: as many are wrong among matches that were checked.
+    """
     bound = (_NO_RELIEF * RANGE) ** 2
+    squares = found.all_weights * apart
     off = squares > _STANDS_OUT**2 * bound
-    if off.all() or np.mean(squares[~off]) > bound:
+    on = found.inlier & ~off
+    if 2 * np.count_nonzero(on) <= np.count_nonzero(found.inlier):
         return False
-    return _is_accidental(found, int(np.count_nonzero(off)))
+    if np.mean(squares[on]) > bound:
+        return False
+    far = off & found.inlier & (squares > (RELIEF * RANGE) ** 2)
+    places = np.count_nonzero(_one_of_each(found.all1[:, far], found.all2[:, far]))
+    if places <= _FEW_FAR * np.count_nonzero(found.inlier):
+        return True
+    return _is_accidental(found, apart, off)
 
 
-def _by_chance(wrong: int, chance: float) -> int:
-    """Return how many of some wrong matches may agree with an F that a homography leaves free.
+def _is_accidental(found: Evidence, apart: Array, off: Mask) -> bool:
+    """Tell whether no more matches off a plane agree with F than wrong ones would by chance.
 
-    Two, through which the epipole is put, and as many more as the best of all pairs finds with
-    99 %: the least q with ``choose(wrong, 2) P(Poisson(wrong chance) > q) <= 0.01``.
+    The line from where the homography takes a match to the match itself is an epipolar line. That
+    of a wrong match which is d off has any direction, and is within a distance l of one with the
+    probability 2 / pi asin(l / d). Matches side by side in both images count as one: features have
+    several scales and orientations, and all of one place fix one line. Wrong matches are anywhere;
+    where more than a few are only slightly off, that is relief.
     """
-    pairs, mean = wrong * (wrong - 1) / 2, min(wrong * chance, 700.0)
-    q, term = 0, float(np.exp(-mean))
-    tail = 1.0 - term
-    while pairs * tail > 0.01 and q < wrong:
-        q += 1
-        term *= mean / q
-        tail -= term
-    return min(_EPIPOLE + q, wrong)
+    agree = np.flatnonzero(off & found.inlier)
+    slight = np.count_nonzero(apart[agree] <= (_SLIGHTLY * found.limit) ** 2)
+    if slight - _EPIPOLE > _FEW_SLIGHT * np.count_nonzero(found.inlier):
+        return False
+    agree = agree[_one_of_each(found.all1[:, agree], found.all2[:, agree])]
+    wrong = np.concatenate([agree, np.flatnonzero(off & ~found.inlier)])
+    with np.errstate(invalid="ignore"):  # infinitely far
+        sine = found.limit / np.sqrt(apart[wrong])
+    chances = 2.0 / np.pi * np.arcsin(np.minimum(sine, 1.0))
+    return chance_pairs(chances, len(agree)) > _BY_CHANCE
+
+
+def _one_of_each(q1: Array, q2: Array) -> Mask:
+    """Return one match of each place."""
+    kept = np.zeros(q1.shape[1], np.bool_)
+    for k in range(len(kept)):
+        beside = [np.abs(q[:, kept] - q[:, [k]]) <= _BESIDE * RANGE for q in (q1, q2)]
+        kept[k] = not np.all(np.vstack(beside), axis=0).any()
+    return kept
+
+
+def chance_pairs(chances: Array, k: int) -> float:
+    """Return with how many pairs of wrong matches k or more are expected to agree.
+
+    An epipole that a homography leaves free can be put on the lines of any two.
+
+    Parameters
+    ----------
+    chances : ndarray, shape (n,)
+        Probability of each wrong match that it agrees.
+    k : int
+        How many do, both of the pair among them.
+
+    Returns
+    -------
+    float
+        ``choose(n, 2) P(k - 2 or more agree)``; infinite for a k of two or less.
+    """
+    more, n = k - _EPIPOLE, len(chances)
+    if more <= 0:
+        return np.inf
+    fewer = np.zeros(more)  # probabilities that 0, 1, ... of the first ones agree
+    fewer[0] = 1.0
+    for chance in chances.tolist():
+        fewer[1:] += chance * (fewer[:-1] - fewer[1:])
+        fewer[0] *= 1.0 - chance
+    return 0.5 * n * (n - 1) * max(1.0 - float(np.sum(fewer)), 0.0)
 
 
 def may_be_rotation(found: Evidence, H: Array, N: Array) -> bool:

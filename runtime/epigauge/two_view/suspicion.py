@@ -93,10 +93,13 @@ def is_inflated(found: Evidence, judged: Evidence) -> bool:
 def is_common(found: Evidence, bar: float = SIGNIFICANT) -> bool:
     """Tell whether more matches agree with F than wrong ones would by chance.
 
-    They would with 10 to the power `bar` geometries at most.
+    They would with 10 to the power `bar` geometries at most. Matches in front of one camera only do
+    not agree.
     """
     limit = min(found.limit, CEILING * RANGE) if found.searched else found.limit
     near = found.squared <= limit**2
+    if found.from_rays is None:
+        near &= found.in_front
     m, agreed = len(found.inlier), int(np.count_nonzero(near))
     if not agreed:
         return False
