@@ -1,12 +1,15 @@
 """What the entries say of scenes that do, nearly do, and do not determine F: a confusion table.
 
-    python benchmarks/verdicts.py [--trials 20] [--write docs/benchmarks/verdicts.md]
+    python benchmarks/verdicts.py [--trials 20] [--parts table random general costs]
 
 Each row is a kind of scene, a number of matches, a share of wrong ones and an entry; each column a
 verdict, with the share of the trials that end in it. "ok" is success without a verdict of the
 others. Entries that take matches for right ones (refine, batch, a COLMAP database) must tell wrong
-ones as gross errors; `estimate_fundamental` must find the right ones. Then the time of the flags
-over that of the refinement, both from one run, minima over the calls.
+ones as gross errors; `estimate_fundamental` must find the right ones.
+
+Then random matches by their number, and general scenes of any focal length, depth, motion, noise
+and share of wrong matches (100 trials of each); then the time of the flags and of the search for
+copies over that of the refinement, both from one run, minima over the calls.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from pathlib import Path
 
 import epigauge as eg
 import numpy as np
+from epigauge.two_view.copies import counted_once
 from epigauge.verdicts import FLAGS
 from numpy.typing import NDArray
 
@@ -38,6 +42,9 @@ VERDICTS = {
     "none in common": ("no common geometry",),
     "gross errors": ("gross errors",),
 }
+
+#: Verdicts that a scene which determines F must not have.
+_DEGENERATE = {"planar scene", "nearly planar", "pure rotation", "still camera"}
 
 _SIZE = np.array([1280.0, 960.0])
 _FOCAL = 1000.0
@@ -64,6 +71,28 @@ def scene(kind: str, m: int, wrong: float, rng: np.random.Generator) -> tuple[Ar
     for x in (x1, x2):
         x[chosen] = rng.uniform([0.0, 0.0], _SIZE, (len(chosen), 2))
     return x1, x2
+
+
+def general(seed: int) -> tuple[Array, Array, int, float]:
+    """Return matches of a scene of any kind that determines F, their number and share of wrong."""
+    rng = np.random.default_rng([7, seed])
+    m, wrong = int(rng.integers(30, 501)), float(rng.choice([0.0, 0.1, 0.3, 0.5]))
+    focal, near = rng.uniform(600.0, 2000.0), rng.uniform(2.0, 6.0)
+    X = np.column_stack([rng.uniform(-0.5, 0.5, (m, 2)) * _SIZE / focal, np.ones(m)])
+    X *= near * rng.uniform(1.0, rng.uniform(1.6, 4.0), m)[:, None]
+    t = rng.standard_normal(3)
+    t *= rng.uniform(0.1, 0.3) * near / np.linalg.norm(t)
+    axis = rng.standard_normal(3)
+    C = np.cross(np.eye(3), -axis / np.linalg.norm(axis))
+    angle = rng.uniform(0.0, 0.25)
+    R = np.eye(3) + np.sin(angle) * C + (1.0 - np.cos(angle)) * C @ C
+    x1, x2 = (focal * Y[:, :2] / Y[:, 2:] + _SIZE / 2.0 for Y in (X, X @ R.T + t))
+    noise = rng.uniform(0.1, 0.8)
+    x1, x2 = (x + noise * rng.standard_normal((m, 2)) for x in (x1, x2))
+    chosen = rng.permutation(m)[: round(wrong * m)]
+    for x in (x1, x2):
+        x[chosen] = rng.uniform([0.0, 0.0], _SIZE, (len(chosen), 2))
+    return x1, x2, m, wrong
 
 
 def batched(x1: Array, x2: Array) -> tuple[tuple[str, ...], bool]:
@@ -142,6 +171,35 @@ def row(kind: str, m: int, wrong: float, entry: str, trials: int) -> list[str]:
     return [f"{count[name] / trials:.2f}" if count[name] else "." for name in COLUMNS]
 
 
+def random_row(m: int, entry: str, trials: int) -> str:
+    """Return how many sets of random matches are told, and how many end with success."""
+    named = successes = 0
+    for seed in range(trials):
+        x1, x2 = scene("random", m, 0.0, np.random.default_rng([99, m, seed]))
+        flags, success = ENTRIES[entry](x1, x2)
+        named += "no common geometry" in flags
+        successes += success
+    return f"| {m} | {entry} | {trials} | {named} | {successes} |"
+
+
+def general_row(entry: str, trials: int) -> str:
+    """Return what is said of general scenes, with and without wrong matches taken for right."""
+    tally: Counter[str] = Counter()
+    for seed in range(trials):
+        x1, x2, _, wrong = general(seed)
+        told = "right" if not wrong or entry == "estimate_fundamental" else "wrong"
+        flags, success = ENTRIES[entry](x1, x2)
+        tally[told] += 1
+        tally["degenerate"] += not set(flags).isdisjoint(_DEGENERATE)
+        tally["gross errors"] += "gross errors" in flags
+        tally["none in common"] += "no common geometry" in flags
+        tally["success"] += success and told == "right"
+    return (
+        f"| {entry} | {tally['right']} | {tally['success']} | {tally['wrong']} | "
+        f"{tally['gross errors']} | {tally['none in common']} | {tally['degenerate']} |"
+    )
+
+
 def costs() -> list[str]:
     """Return the times of refinement and flags: general scenes, and Bartoli and Sturm's at 10 m."""
     lines = ["| scene | matches | refinement | with flags | flags / refinement |", f"|{'---|' * 5}"]
@@ -186,7 +244,29 @@ def least(call: Callable[[], object]) -> float:
     return min(times)
 
 
+def copies() -> list[str]:
+    """Return the time of the search for repeated matches, and of a refinement."""
+    lines = ["| matches | copies | refinement | search for copies | share |", f"|{'---|' * 5}"]
+    for m, share in itertools.product((50, 100, 500, 1000, 10_000), (0.0, 0.3)):
+        times = []
+        for seed in range(5):
+            rng = np.random.default_rng([m, seed])
+            x1, x2 = scene("general", m, 0.0, rng)
+            again = rng.integers(0, m // 2, int(share * m))
+            x1[m - len(again) :], x2[m - len(again) :] = x1[again], x2[again]
+            F0 = eg.fundamental_8point(x1, x2)
+            alone = least(lambda x1=x1, x2=x2, F0=F0: eg.refine_fundamental(x1, x2, F0))
+            times.append((alone, least(lambda x1=x1, x2=x2: counted_once(x1, x2, None))))
+        whole, own = np.median(times, axis=0)
+        lines.append(
+            f"| {m} | {share:.0%} | {1e3 * whole:.3f} ms | {1e3 * own:.4f} ms | {own / whole:.2f} |"
+        )
+    return lines
+
+
 COLUMNS = ("ok", *VERDICTS, "success")
+
+PARTS = ("table", "random", "general", "costs")
 
 
 def main() -> None:
@@ -194,21 +274,34 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--trials", type=int, default=20)
     parser.add_argument("--entries", nargs="*", default=list(ENTRIES), choices=list(ENTRIES))
-    parser.add_argument("--write", type=Path)
+    parser.add_argument("--parts", nargs="*", default=list(PARTS), choices=PARTS)
     options = parser.parse_args()
-    head = ("scene", "matches", "wrong", "entry", *COLUMNS)
-    lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
-    print("\n".join(lines), flush=True)
-    for kind, wrong, m in itertools.product(KINDS, (0.0, 0.3), (50, 500)):
+    if "table" in options.parts:
+        show(["scene", "matches", "wrong", "entry", *COLUMNS])
+        for kind, wrong, m in itertools.product(KINDS, (0.0, 0.3), (50, 500)):
+            if kind == "random" and wrong:
+                continue  # all are wrong
+            for entry in options.entries:
+                shares = row(kind, m, wrong, entry, options.trials)
+                print(
+                    f"| {kind} | {m} | {wrong:.0%} | {entry} | {' | '.join(shares)} |", flush=True
+                )
+    if "random" in options.parts:
+        show(["random matches", "entry", "trials", "no common geometry", "success"])
+        for m, entry in itertools.product((8, 9, 10, 12, 20, 50, 200, 2000), options.entries):
+            print(random_row(m, entry, 5 * options.trials), flush=True)
+    if "general" in options.parts:  # what takes matches for right is not to be used with wrong ones
+        told = ("gross errors", "none in common", "degenerate")
+        show(["entry", "to be used", "success", "not to be used", *told])
         for entry in options.entries:
-            shares = row(kind, m, wrong, entry, options.trials)
-            line = f"| {kind} | {m} | {wrong:.0%} | {entry} | {' | '.join(shares)} |"
-            lines.append(line)
-            print(line, flush=True)
-    lines += ["", *costs()]
-    print("\n".join(lines[-10:]), flush=True)
-    if options.write:
-        options.write.write_text("\n".join(lines) + "\n", encoding="utf-8")
+            print(general_row(entry, 10 * options.trials), flush=True)
+    if "costs" in options.parts:
+        print("\n".join(["", *costs(), "", *copies()]), flush=True)
+
+
+def show(head: list[str]) -> None:
+    """Print the head of a table."""
+    print(f"\n| {' | '.join(head)} |\n|{'---|' * len(head)}", flush=True)
 
 
 if __name__ == "__main__":
