@@ -21,6 +21,8 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge.cameras import AffineReconstruction, Cameras, MetricReconstruction
     from epigauge.errors import ArgumentError, BackendError, EpigaugeError, FileFormatError
     from epigauge.images import ImageMatches, load_image, match_images
+    from epigauge.images.pairwise import PairwiseMatches, match_photographs
+    from epigauge.images.tracks import build_tracks
     from epigauge.io import (
         Matches,
         load_matches,
@@ -82,6 +84,7 @@ __all__ = [
     "MetricReconstruction",
     "MetricUpgrade",
     "MultiViewScene",
+    "PairwiseMatches",
     "PointPrior",
     "PositionPrior",
     "Reconstruction",
@@ -92,6 +95,7 @@ __all__ = [
     "TwoViewScene",
     "arrays",
     "backend",
+    "build_tracks",
     "bundle_adjust",
     "canonical_cameras",
     "casadi",
@@ -115,6 +119,7 @@ __all__ = [
     "load_scene",
     "load_tracks",
     "match_images",
+    "match_photographs",
     "metric_upgrade",
     "multi_view_scene",
     "refine_fundamental",
@@ -138,6 +143,8 @@ _WHERE = {
     "cameras": "AffineReconstruction Cameras MetricReconstruction",
     "errors": "ArgumentError BackendError EpigaugeError FileFormatError",
     "images": "ImageMatches load_image match_images",
+    "images.pairwise": "PairwiseMatches match_photographs",
+    "images.tracks": "build_tracks",
     "io": (
         "Matches load_matches load_reconstruction load_result load_scene load_tracks "
         "save_matches save_reconstruction save_result save_scene save_tracks"

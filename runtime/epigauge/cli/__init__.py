@@ -23,6 +23,7 @@ from epigauge.cli.metric import metric
 from epigauge.cli.pair import pair
 from epigauge.cli.refine import refine
 from epigauge.cli.reproduce import reproduce
+from epigauge.cli.scene import scene
 
 __all__ = ["app"]
 
@@ -61,6 +62,7 @@ for _function in (
     pair,
     bundle,
     metric,
+    scene,
     compare,
     colmap,
     data,

@@ -315,7 +315,10 @@ class _Answer:
         if path.suffix.lower() == ".html":
             from epigauge.reports import save_viewer
 
-            numbers = {"view_numbers": self.file.views, "point_numbers": self.file.points}
+            numbers: dict[str, Any] = {
+                "view_numbers": self.file.views,
+                "point_numbers": self.file.points,
+            }
             save_viewer(path, result, tracks, title, frame=self.frame, **numbers)
             return
         from epigauge.plots import plot_bundle, save_figure

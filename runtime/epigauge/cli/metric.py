@@ -34,7 +34,7 @@ from epigauge.io._npz_scene import write_npz_scene
 from epigauge.multi_view.display import display
 from epigauge.verdicts import explained, usable
 
-__all__ = ["metric"]
+__all__ = ["camera_rows", "metric"]
 
 
 def metric(
@@ -187,7 +187,7 @@ class _Answer:
             f"{len(tracks)} observations",
         }
         if result.reconstruction is not None:
-            rows |= self._cameras(result.reconstruction.cameras)
+            rows |= camera_rows(result, result.reconstruction.cameras)
             count = int(np.count_nonzero(result.rejected))
             rows["rms_px"] = f"{result.rms_px:.6g} per coordinate"
             rows["set aside"] = f"{count} of {len(tracks)} observations, as gross errors"
@@ -200,25 +200,22 @@ class _Answer:
         if not result.success:
             out.print(f"[bold red]not determined:[/] {escape(result.message)}", soft_wrap=True)
 
-    def _cameras(self, cameras: eg.Cameras) -> dict[str, str]:
-        """Return each kind of parameter with its standard deviation, of up to three cameras."""
-        result = self.result
-        model = camera_model(cameras.model)
-        rows = {"cameras": f"{len(cameras)} of the model {cameras.model}"}
-        for c in range(min(len(cameras), 3)):
-            std = np.full(len(model.params), np.inf)
-            if result.covariance is not None:
-                std[: len(model.adjusted)] = np.sqrt(np.diag(result.covariance.intrinsics(c)))
-            for name, unit, value, sigma in zip(
-                model.params, model.units, cameras.params[c], std, strict=True
-            ):
-                label = name if len(cameras) == 1 else f"{name} of camera {c}"
-                free = name in result.refined
-                end = f"+- {sigma:.3g}" if free else "(not refined)"
-                rows[label] = f"{value:.7g} {end}{' px' if unit == 'px' else ''}"
-        if len(cameras) > 3:
-            focal, std = self.focal
-            rows["all f"] = ", ".join(
-                f"{f:.5g} +- {s:.2g}" for f, s in zip(focal, std, strict=True)
-            )
-        return rows
+
+def camera_rows(result: eg.MetricUpgrade, cameras: eg.Cameras) -> dict[str, str]:
+    """Return the parameters of up to three cameras with their standard deviations."""
+    model = camera_model(cameras.model)
+    rows = {"cameras": f"{len(cameras)} of the model {cameras.model}"}
+    for c in range(min(len(cameras), 3)):
+        std = np.full(len(model.params), np.inf)
+        if result.covariance is not None:
+            std[: len(model.adjusted)] = np.sqrt(np.diag(result.covariance.intrinsics(c)))
+        for name, unit, value, sigma in zip(
+            model.params, model.units, cameras.params[c], std, strict=True
+        ):
+            label = name if len(cameras) == 1 else f"{name} of camera {c}"
+            end = f"+- {sigma:.3g}" if name in result.refined else "(not refined)"
+            rows[label] = f"{value:.7g} {end}{' px' if unit == 'px' else ''}"
+    if len(cameras) > 3:
+        focal, std = np.atleast_1d(result.focal_px), np.atleast_1d(result.focal_std_px)
+        rows["all f"] = ", ".join(f"{f:.5g} +- {s:.2g}" for f, s in zip(focal, std, strict=True))
+    return rows

@@ -118,13 +118,13 @@ def match_images(
     max_features = as_count("max_features", max_features, at_least=8)
 
     cv2 = opencv()
-    seeker = _seeker(cv2, detector, max_features)
+    found_by = seeker(cv2, detector, max_features)
     sizes, found = [], []
     for name, source in (("image1", image1), ("image2", image2)):
         image = as_image(name, source)
         shown = os.fspath(source) if isinstance(source, str | os.PathLike) else name
         sizes.append((image.shape[1], image.shape[0]))
-        found.append(_features(cv2, seeker, shown, image, max_size, max_features))
+        found.append(features(cv2, found_by, shown, image, max_size, max_features))
     (x1, descriptors1), (x2, descriptors2) = found
     rows1, rows2 = _mutual(cv2, descriptors1, descriptors2, ratio)
     pairs = np.column_stack([x1[rows1], x2[rows2]])
@@ -145,7 +145,7 @@ def match_images(
     )
 
 
-def _seeker(cv2: Any, detector: str, max_features: int) -> Any:
+def seeker(cv2: Any, detector: str, max_features: int) -> Any:
     """Make OpenCV's detector and descriptor of that name."""
     name, options = DETECTORS[detector]
     # OpenCV 5 has moved some into the module xfeatures2d of its contributed part.
@@ -161,7 +161,7 @@ def _seeker(cv2: Any, detector: str, max_features: int) -> Any:
     )
 
 
-def _features(
+def features(
     cv2: Any, seeker: Any, name: str, image: Image, max_size: int, max_features: int
 ) -> tuple[Array, NDArray[Any]]:
     """Return positions (n, 2) in pixels of the full image, and descriptors (n, k)."""

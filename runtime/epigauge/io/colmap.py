@@ -146,6 +146,19 @@ class ColmapDatabase:
         with sqlite_errors(self.path):
             return {number: str(name) for number, name in self._connection.execute(query)}
 
+    def sizes(self) -> dict[int, tuple[int, int]]:
+        """Return width and height of the images by their numbers, of those with a camera."""
+        query = (
+            "SELECT image_id, width, height FROM images JOIN cameras USING (camera_id) "
+            "WHERE width > 0 AND height > 0"
+        )
+        with sqlite_errors(self.path):
+            try:
+                rows = self._connection.execute(query).fetchall()
+            except sqlite3.OperationalError:  # no such table or column
+                return {}
+        return {number: (int(width), int(height)) for number, width, height in rows}
+
     def count(self) -> int:
         """Return the number of verified pairs: those with inliers."""
         query = "SELECT count(*) FROM two_view_geometries WHERE rows > 0"

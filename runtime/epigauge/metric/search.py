@@ -143,13 +143,16 @@ class Search:
                 break
         return best
 
-    def misfit(self, fit: Fit) -> bool:
-        """Tell whether projective cameras explain the tracks much better than metric ones."""
-        return fit.typical > _MISFIT * fit.projective + 1e-6 * float(self.images.unit.max())
+    def misfit(self, fit: Fit, typical: float) -> bool:
+        """Tell whether projective cameras explain the sample much better than metric ones.
+
+        These have `typical`, a median distance of the sample's observations.
+        """
+        return typical > _MISFIT * fit.projective + 1e-6 * float(self.images.unit.max())
 
     def _doubted(self, fit: Fit) -> bool:
         rough = fit.typical > _ROUGH * float(self.images.unit.min())
-        return rough or fit.ahead < _AHEAD or self.misfit(fit)
+        return rough or fit.ahead < _AHEAD or self.misfit(fit, fit.typical)
 
     def _projective(self, given: Reconstruction | None, robust: bool) -> BundleResult:
         """Return a projective reconstruction of the sample, robustly adjusted."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from epigauge.multi_view.adjust import BundleResult, bundle_adjust
 from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.tracks import MIN_VIEWS, Tracks
 from epigauge.multi_view.uncertainty import covariance
+from epigauge.two_view.losses import median
 from epigauge.uncertainty.covariance import MetricCovariance
 from epigauge.verdicts import FLAGS, ordered, usable
 
@@ -28,6 +29,9 @@ __all__ = ["MetricUpgrade", "metric_upgrade"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+
+#: Adjustments at most, each without the points that the one before put behind cameras.
+_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -208,10 +212,32 @@ def metric_upgrade(
         start = with_all_points(start, tracks, images, kernels.table(backend))
     options: Any = {"refine": fit.refined, "workers": workers, "backend": backend}
     try:
-        bundle = bundle_adjust(tracks, start, robust=True, ftol=1e-6, **options)
+        bundle = _in_front(tracks, start, options)
     except ArgumentError:  # so degenerate that no step can be made
         return _nothing(tracks, images, ("undetermined",))
     return _judged(tracks, images, search, fit, bundle, backend)
+
+
+def _in_front(tracks: Tracks, start: MetricReconstruction, options: Any) -> BundleResult:
+    """Return the adjustment without gross errors, and without points behind cameras that see them.
+
+    These agree with the cameras by chance: two of their observations are on epipolar lines.
+    """
+    weights = np.asarray(tracks.weights)
+    for _ in range(_ROUNDS):
+        bundle = bundle_adjust(tracks.weighted(weights), start, robust=True, ftol=1e-6, **options)
+        start = bundle.reconstruction
+        counts = ~bundle.rejected & (weights > 0.0)
+        behind = np.zeros(tracks.n_points, dtype=np.bool_)
+        behind[tracks.point[counts & ~(start.depths(tracks) > 0.0)]] = True
+        if not behind.any():
+            break
+        weights = np.where(behind[tracks.point], 0.0, weights)
+    flags = bundle.flags
+    if not behind.any():
+        flags = tuple(flag for flag in flags if flag != "behind the cameras")
+    rejected = bundle.rejected | ((weights == 0.0) & (tracks.weights > 0.0))
+    return replace(bundle, rejected=rejected, flags=flags)
 
 
 def _judged(
@@ -242,7 +268,8 @@ def _judged(
     flags |= set(motion_flags(found, images, turn_std))
     if (share > OPEN).any():
         flags.add("undetermined")
-    if search.misfit(fit):
+    of_sample = np.isin(tracks.point, search.sample.points)
+    if search.misfit(fit, median(np.linalg.norm(bundle.fun[of_sample], axis=1))):
         flags.add("unlike cameras")
     listed = ordered(flags)
     spoiling = [f"{name}: {FLAGS[name].sentence}" for name in listed if not usable([name], "views")]

@@ -92,6 +92,10 @@ function shades(colouring) {
 function start() {
   const data = JSON.parse(document.getElementById("data").textContent);
   const by = (id) => document.getElementById(id);
+  if (data.colours) {
+    by("colour").add(new Option("colours of the photographs", "photo"), 0);
+    by("colour").value = "photo";
+  }
   const canvas = by("scene"), tip = by("tip"), pen = canvas.getContext("2d");
   const colours = palette(), count = data.rms.length;
   const xs = new Float32Array(count), ys = new Float32Array(count), zs = new Float32Array(count);
@@ -132,6 +136,13 @@ function start() {
   }
 
   function colour() {
+    const photo = by("colour").value === "photo";
+    by("legend").hidden = photo;
+    if (photo) {
+      painted = null;
+      draw();
+      return;
+    }
     const colouring = colourings(data)[by("colour").value];
     painted = shades(colouring);
     by("what").textContent = colouring.words;
@@ -201,7 +212,7 @@ function start() {
     const haze = high > low ? FOGS / (high - low) : 0;
     for (const k of order) {
       const size = clamp((usual * view.distance) / zs[k], 0.25 * usual, 4 * usual);
-      pen.fillStyle = colours[painted.shade[k]][clamp(Math.floor((zs[k] - low) * haze), 0, FOGS - 1)];
+      pen.fillStyle = painted === null ? data.colours[k] : colours[painted.shade[k]][clamp(Math.floor((zs[k] - low) * haze), 0, FOGS - 1)];
       if (size < 3.5) pen.fillRect(xs[k] - size / 2, ys[k] - size / 2, size, size);
       else {
         pen.beginPath();
@@ -264,10 +275,10 @@ function start() {
   function describe(thing) {
     if (thing.point === undefined) {
       const camera = data.cameras[thing.camera];
-      return [`view ${camera.number}`, `${camera.points} points` + (camera.rms === null ? "" : `, RMS ${camera.rms.toPrecision(3)} px`)];
+      return [camera.name || `view ${camera.number}`, `${camera.points} points` + (camera.rms === null ? "" : `, RMS ${camera.rms.toPrecision(3)} px`)];
     }
     const k = thing.point, at = data.points.slice(3 * k, 3 * k + 3).map((value) => value.toFixed(3));
-    const views = seenBy(k).map((i) => data.cameras[i].number);
+    const views = seenBy(k).map((i) => data.cameras[i].name || data.cameras[i].number);
     const listed = views.slice(0, 12).join(", ") + (views.length > 12 ? ", \u2026" : "");
     return [`point ${data.number[k]}`, `RMS ${data.rms[k].toPrecision(3)} px in ${views.length} views: ${listed}`, `(${at.join(", ")})`];
   }

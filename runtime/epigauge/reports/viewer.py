@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ def save_viewer(
     frame: Display | None = None,
     view_numbers: ArrayLike | None = None,
     point_numbers: ArrayLike | None = None,
+    notes: Sequence[str] = (),
 ) -> None:
     """Write points and cameras as a page to look at them from all sides.
 
@@ -57,6 +59,8 @@ def save_viewer(
         Where to show them; by default ``display(result.reconstruction, tracks)``.
     view_numbers, point_numbers : array_like of int, optional
         What to call views and points, if not by their indices.
+    notes : sequence of str
+        Sentences to show below the title.
 
     Raises
     ------
@@ -82,6 +86,7 @@ def save_viewer(
     hidden = tracks.n_points - int(shown.shown.sum())
     if hidden:
         lead += f" {hidden} points far away or behind a camera are not shown."
+    lead += "".join(f"<br>{html.escape(note)}" for note in notes)
     parts = {
         "title": html.escape(title or "Reconstruction"),
         "lead": lead,
@@ -115,6 +120,7 @@ def _data(
     kept = shown.shown & np.isfinite(rms)
     X = shown.points[kept]
     counts = np.bincount(tracks.point, minlength=tracks.n_points)[kept]
+    names = tracks.names or [""] * tracks.n_views
     near = _without_strays(X)
     around = np.vstack([shown.centres, near[:: -(-max(len(near), 1) // _FITTED)]])
     low, high = around.min(axis=0), around.max(axis=0)
@@ -124,19 +130,22 @@ def _data(
         "number": point_numbers[kept].tolist(),
         "rms": _rounded(rms[kept], 4),
         "views": counts.tolist(),
+        "colours": None if tracks.colours is None else _hex(tracks.colours[kept]),
         # The tracks are sorted by point: the views of point k are seen[first[k]:first[k + 1]].
         "seen": tracks.view[kept[tracks.point]].tolist(),
         "first": [0, *np.cumsum(counts).tolist()],
         "cameras": [
             {
                 "number": int(number),
+                "name": html.escape(name),
                 "centre": _rounded(centre, 4),
                 "corners": [_rounded(corner, 4) for corner in corners],
                 "points": int(points),
                 "rms": plain(np.round(of_view, 4)),
             }
-            for number, centre, corners, points, of_view in zip(
+            for number, name, centre, corners, points, of_view in zip(
                 view_numbers,
+                names,
                 shown.centres,
                 shown.corners,
                 np.bincount(tracks.view, minlength=tracks.n_views),
@@ -165,6 +174,11 @@ def _rms(index: NDArray[np.intp], squared: Array, count: int) -> Array:
     """Return the RMS residual coordinate of each point or view."""
     total = np.bincount(index, squared, minlength=count)
     return np.asarray(np.sqrt(total / (2.0 * np.bincount(index, minlength=count))))
+
+
+def _hex(colours: NDArray[np.uint8]) -> list[str]:
+    """Return colours as HTML writes them."""
+    return [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in colours.tolist()]
 
 
 def _rounded(values: Array, decimals: int) -> list[float]:

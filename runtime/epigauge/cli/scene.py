@@ -1,0 +1,254 @@
+"""``epigauge scene``: photographs, or a COLMAP database, to a metric scene in a folder."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+import epigauge as eg
+from epigauge.cli._common import DONE, NOT_CONVERGED, console, facts, shown
+from epigauge.cli._scenes import save_cloud
+from epigauge.cli.metric import camera_rows
+from epigauge.errors import ArgumentError, FileFormatError
+from epigauge.images.tracks import NoTracks, TrackSource, build_tracks
+from epigauge.io import plain, save_scene
+from epigauge.io._npz_scene import write_npz_scene
+from epigauge.io.output import json_text
+from epigauge.multi_view.display import display
+from epigauge.reports import save_viewer
+from epigauge.verdicts import explained, usable
+
+__all__ = ["scene"]
+
+#: Photographs in a folder are files with these endings.
+_PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".ppm", ".pgm")
+_DATABASES = (".db", ".sqlite", ".sqlite3")
+
+
+def scene(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(help="Photographs, folders of them, or one COLMAP database (.db)."),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for everything; new, or empty.")
+    ],
+    cameras: Annotated[
+        str,
+        typer.Option(
+            help="one: the same camera took all; own: each photograph has its own; size: one "
+            "for all photographs of a size; auto: one if all have one size, else own."
+        ),
+    ] = "auto",
+    camera: Annotated[str, typer.Option(help="Camera model.")] = "SIMPLE_RADIAL",
+    pairs: Annotated[str, typer.Option(help="Pairs to match: all or sequential.")] = "all",
+    max_features: Annotated[int, typer.Option(help="Features of each photograph.")] = 5000,
+    cache: Annotated[
+        Path | None, typer.Option(help="NPZ file for features and matches, to begin there again.")
+    ] = None,
+) -> int:
+    """Reconstruct a scene from photographs, knowing nothing of the cameras.
+
+    Writes into the folder a COLMAP model (sparse/0; sparse_text as text), points.ply in colours,
+    scene.npz, report.json with all that is known, and index.html to turn the scene about.
+
+    Photographs that do not belong to the others are left out, and it is said why. Exit code 1
+    with a sentence where there is no scene: photographs that do not match, of something
+    flat, or by a camera that only turned. Then nothing is written.
+    """
+    if cameras not in ("auto", "one", "own", "size"):
+        raise ArgumentError("--cameras", f"is {cameras!r:.60}", "auto, one, own or size")
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise ArgumentError("--output", f"exists: {shown(output)}", "a new or an empty folder")
+    begin, out = time.perf_counter(), console()
+    try:
+        with _progress(out) as told:
+            found = sources[0] if _is_database(sources) else _photographs(sources)
+            options: dict[str, Any] = {}
+            if isinstance(found, list):
+                options = {"pairs": pairs, "max_features": max_features, "cache": cache}
+            tracks = build_tracks(found, progress=told, **options)
+            told("cameras", 0, 1)
+            result = _upgraded(tracks, cameras, camera)
+    except NoTracks as error:
+        out.print(f"[bold red]no scene:[/] the photographs {escape(error.was)}", soft_wrap=True)
+        out.print(f"needed: {escape(error.needed)}", soft_wrap=True)
+        return NOT_CONVERGED
+    answer = _Answer(tracks, result, time.perf_counter() - begin)
+    answer.report(out)
+    if not result.success:
+        return NOT_CONVERGED
+    answer.write(output)
+    out.print(f"written: {escape(shown(output))} (open {escape(shown(output / 'index.html'))})")
+    return DONE
+
+
+def _is_database(sources: list[Path]) -> bool:
+    database = [path for path in sources if path.suffix.lower() in _DATABASES]
+    if database and len(sources) > 1:
+        raise ArgumentError("sources", "mix a database with other files", "one database alone")
+    return bool(database)
+
+
+def _photographs(sources: list[Path]) -> list[Path]:
+    """Return the photographs named, and those in the folders named."""
+    paths: list[Path] = []
+    for source in sources:
+        if source.is_dir():
+            inside = sorted(p for p in source.iterdir() if p.suffix.lower() in _PHOTOS)
+            if not inside:
+                raise FileFormatError(source, f"holds no photographs ({', '.join(_PHOTOS)})")
+            paths += inside
+        else:
+            paths.append(source)
+    return paths
+
+
+class _progress:
+    """Bars for what is being done."""
+
+    def __init__(self, out: Console) -> None:
+        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+        self.bars = Progress(*columns, TimeElapsedColumn(), console=out, transient=True)
+        self.tasks: dict[str, Any] = {}
+
+    def __enter__(self) -> Callable[[str, int, int], object]:
+        self.bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bars.stop()
+
+    def __call__(self, what: str, done: int, count: int) -> None:
+        if what not in self.tasks:
+            for task in self.tasks.values():
+                self.bars.update(task, completed=self.bars.tasks[task].total)
+            self.tasks[what] = self.bars.add_task(what, total=count)
+        self.bars.update(self.tasks[what], completed=done)
+
+
+def _upgraded(tracks: eg.Tracks, cameras: str, camera: str) -> eg.MetricUpgrade:
+    """Return the metric scene; with "auto", of own cameras where one does not fit."""
+    sizes = np.asarray(tracks.sizes)
+    kinds = np.unique(sizes, axis=0, return_inverse=True)[1].ravel()
+    one = len(np.unique(kinds)) == 1
+    shared: Any = {"one": True, "own": False, "size": kinds, "auto": one}[cameras]
+    result = eg.metric_upgrade(tracks, image_size=sizes, shared=shared, camera=camera)
+    if cameras == "auto" and one and "unlike cameras" in result.flags:
+        other = eg.metric_upgrade(tracks, image_size=sizes, shared=False, camera=camera)
+        result = other if other.success else result
+    return result
+
+
+class _Answer:
+    """A scene from photographs and the forms it is given in."""
+
+    def __init__(self, tracks: eg.Tracks, result: eg.MetricUpgrade, seconds: float) -> None:
+        self.tracks, self.result, self.seconds = tracks, result, seconds
+        source = tracks.source
+        assert isinstance(source, TrackSource)
+        self.source = source
+
+    def notes(self) -> list[str]:
+        """Return what people should know, a sentence each."""
+        result = self.result
+        focal, std = np.atleast_1d(result.focal_px), np.atleast_1d(result.focal_std_px)
+        several = "" if len(focal) == 1 else f" (first of {len(focal)} cameras)"
+        lines = [f"Focal length {focal[0]:.6g} +- {std[0]:.2g} px{several}; {self.seconds:.0f} s."]
+        lines += [f"{flag}: {text}" for flag, text in explained(result.flags).items()]
+        lines += [f"Left out: {name} {why}." for name, why in self.source.left_out.items()]
+        return lines
+
+    def report(self, out: Console) -> None:
+        """Tell people on stderr what came out."""
+        result, tracks = self.result, self.tracks
+        count = len(self.source.left_out)
+        rows = {
+            "photographs": f"{tracks.n_views} of {tracks.n_views + count}",
+            "tracks": f"{tracks.n_points} points, {len(tracks)} observations",
+        }
+        if result.reconstruction is not None:
+            rows |= camera_rows(result, result.reconstruction.cameras)
+            rejected = int(np.count_nonzero(result.rejected))
+            rows["rms_px"] = f"{result.rms_px:.6g} per coordinate"
+            rows["set aside"] = f"{rejected} observations, as gross errors"
+        rows["status"] = escape(result.message)
+        rows["seconds"] = f"{self.seconds:.1f}"
+        out.print(facts("scene", rows))
+        for name, text in explained(result.flags).items():
+            style = "bold yellow" if usable([name], "views") else "bold red"
+            out.print(f"[{style}]{name}:[/] {escape(text)}", soft_wrap=True)
+        for name, why in self.source.left_out.items():
+            out.print(f"[bold]left out:[/] {escape(name)} {escape(why)}", soft_wrap=True)
+        if not result.success:
+            out.print(f"[bold red]no scene:[/] {escape(result.message)}", soft_wrap=True)
+
+    def write(self, output: Path) -> None:
+        """Write everything into a folder that takes its name only when it is complete."""
+        output.absolute().parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix=f".{output.name}.", dir=output.absolute().parent))
+        try:
+            self._fill(folder)
+            folder.chmod(0o755)
+            if output.exists():
+                output.rmdir()
+            folder.replace(output)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+
+    def _fill(self, folder: Path) -> None:
+        tracks, found = self.result.kept(self.tracks)
+        (folder / "sparse").mkdir()
+        save_scene(folder / "sparse" / "0", tracks, found)
+        save_scene(folder / "sparse_text", tracks, found, text=True)
+        note = "points in the colours of the photographs, cameras orange"
+        save_cloud(folder / "points.ply", found.X, found.centres, note, tracks.colours)
+        write_npz_scene(folder / "scene.npz", tracks, found, {})
+        (folder / "report.json").write_text(json_text(plain(self._document())) + "\n")
+        bundle = self.result.bundle
+        assert bundle is not None  # of a success
+        shown_result = replace(bundle, reconstruction=found, fun=tracks.xy - found.project(tracks))
+        frame = display(found, tracks, y_up=False)
+        save_viewer(
+            folder / "index.html", shown_result, tracks, "Scene", frame=frame, notes=self.notes()
+        )
+
+    def _document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        result, cameras = self.result, self.result.reconstruction.cameras  # type: ignore[union-attr]
+        known = result.covariance
+        std = None
+        if known is not None:
+            std = [np.sqrt(np.diag(known.intrinsics(c))) for c in range(len(cameras))]
+        return {
+            "photographs": list(self.tracks.names or ()),
+            "left_out": self.source.left_out,
+            "camera_model": cameras.model,
+            "camera_params": cameras.params,
+            "camera_params_std": std,
+            "camera_of_photograph": cameras.camera_of_view,
+            "refined": result.refined,
+            "focal_px": result.focal_px,
+            "focal_std_px": result.focal_std_px,
+            "flags": result.flags,
+            "message": result.message,
+            "rms_px": result.rms_px,
+            "noise_px": result.noise_px,
+            "n_points": self.tracks.n_points,
+            "n_observations": len(self.tracks),
+            "n_rejected": int(np.count_nonzero(result.rejected)),
+            "pairs": self.source.pairs,
+            "seconds": self.seconds,
+        }

@@ -1,0 +1,297 @@
+"""Features of many photographs and the matches of their pairs, kept together."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge._arguments import as_count, as_positive
+from epigauge.errors import ArgumentError, FileFormatError
+from epigauge.images.loading import Image, load_image, opencv
+from epigauge.images.matching import features, seeker
+from epigauge.io._common import PathLike
+from epigauge.io.output import writing
+
+__all__ = ["PairwiseMatches", "match_photographs"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: Descriptors compared at a time: what they take stays in the cache.
+_BLOCK = 512
+
+#: Half the side of the square of pixels whose mean is the colour of a feature.
+_COLOUR = 1
+
+Told = Callable[[str, int, int], object]
+
+
+@dataclass(frozen=True, eq=False)
+class PairwiseMatches:
+    """Points found in each of several images, and which of them may be the same.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Names of the images.
+    sizes : ndarray of int, shape (n, 2)
+        Width and height in pixels.
+    points : tuple of ndarray, shape (k, 2)
+        Places of the features of each image, in pixels; (0, 0) is the centre of the first pixel.
+    pairs : dict of (int, int) to ndarray of int, shape (m, 2)
+        For images i < j rows of features in i and j that match. Wrong ones may be among them.
+    colours : tuple of ndarray of uint8, shape (k, 3), optional
+        Red, green, blue of each feature.
+    """
+
+    names: tuple[str, ...]
+    sizes: Indices
+    points: tuple[Array, ...]
+    pairs: dict[tuple[int, int], Indices] = field(repr=False)
+    colours: tuple[NDArray[np.uint8], ...] | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        if np.shape(self.sizes) != (n, 2):
+            raise ArgumentError("sizes", f"has shape {np.shape(self.sizes)}", f"({n}, 2)")
+        if len(self.points) != n or (self.colours is not None and len(self.colours) != n):
+            raise ArgumentError("points", f"has {len(self.points)} entries", f"{n}, one an image")
+        for (i, j), rows in self.pairs.items():
+            if not 0 <= i < j < n:
+                raise ArgumentError("pairs", f"names ({i}, {j})", f"images i < j < {n}")
+            rows = np.asarray(rows)
+            if rows.ndim != 2 or rows.shape[1] != 2 or rows.dtype.kind not in "iu":
+                was = f"holds {rows.dtype} {rows.shape} of images {i} and {j}"
+                raise ArgumentError("pairs", was, "integers (m, 2)")
+            if len(rows) and (
+                rows.min() < 0 or np.any(rows.max(axis=0) >= [len(self.points[k]) for k in (i, j)])
+            ):
+                raise ArgumentError(
+                    "pairs", f"names features of images {i} and {j} that are not", "rows of points"
+                )
+
+    def save(self, path: PathLike) -> None:
+        """Write everything to an NPZ file.
+
+        Parameters
+        ----------
+        path : str or path
+            File.
+        """
+        arrays: dict[str, Any] = {
+            "names": np.array(self.names),
+            "sizes": self.sizes,
+            "count": np.array([len(p) for p in self.points]),
+            "points": np.concatenate([np.zeros((0, 2)), *self.points]),
+            "images": np.array(list(self.pairs), dtype=np.int64).reshape(-1, 2),
+            "matches": np.array([len(m) for m in self.pairs.values()], dtype=np.int64),
+            "rows": np.concatenate([np.zeros((0, 2), np.int64), *self.pairs.values()]),
+        }
+        if self.colours is not None:
+            arrays["colours"] = np.concatenate([np.zeros((0, 3), np.uint8), *self.colours])
+        with writing(Path(path)) as stream:
+            np.savez_compressed(stream, **arrays)
+
+    @staticmethod
+    def load(path: PathLike) -> PairwiseMatches:
+        """Read what `save` wrote.
+
+        Parameters
+        ----------
+        path : str or path
+            File.
+
+        Returns
+        -------
+        PairwiseMatches
+            The same.
+
+        Raises
+        ------
+        FileFormatError
+            If the file is another one, or damaged.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                z = {key: data[key] for key in data.files}
+            ends = np.cumsum(z["count"])[:-1]
+            parts = np.split(z["rows"].astype(np.intp), np.cumsum(z["matches"])[:-1])
+            images = map(tuple, z["images"].tolist())
+            colours = tuple(np.split(z["colours"], ends)) if "colours" in z else None
+            return PairwiseMatches(
+                tuple(z["names"].tolist()),
+                z["sizes"],
+                tuple(np.split(z["points"], ends)),
+                dict(zip(images, parts, strict=False)),
+                colours,
+            )
+        except (KeyError, ValueError, IndexError, TypeError, EOFError) as error:
+            raise FileFormatError(path, "is no file of PairwiseMatches.save") from error
+
+
+def match_photographs(
+    images: Sequence[PathLike],
+    *,
+    pairs: str | Iterable[tuple[int, int]] = "all",
+    detector: str = "sift",
+    ratio: float = 0.8,
+    max_size: int = 2400,
+    max_features: int = 8000,
+    progress: Told | None = None,
+) -> PairwiseMatches:
+    """Find features in photographs, and match them pair by pair.
+
+    Parameters
+    ----------
+    images : sequence of paths
+        Photographs.
+    pairs : "all", "sequential" or iterable of (int, int)
+        Which to match: all, each with the next five, or those listed.
+    detector : {"sift", "orb", "akaze", "brisk", "kaze"}
+        As of `match_images`. SIFT's descriptors are compared by their square roots (RootSIFT [1]_).
+    ratio : float
+        Largest ratio of the distances to the nearest and second nearest descriptor, from both
+        sides.
+    max_size, max_features : int
+        As of `match_images`.
+    progress : callable, optional
+        Called with what is being done, how many of it are done, and of how many.
+
+    Returns
+    -------
+    PairwiseMatches
+        Matches not verified by any geometry: see `build_tracks`.
+
+    Raises
+    ------
+    ArgumentError
+        On fewer than two images, or pairs that are not of them.
+    FileFormatError, OSError, MissingPackageError
+        As `load_image`.
+
+    References
+    ----------
+    .. [1] R. Arandjelovic, A. Zisserman, "Three things everyone should know to improve object
+       retrieval", CVPR 2012.
+    """
+    paths = [Path(path) for path in images]
+    if len(paths) < 2:
+        raise ArgumentError("images", f"holds {len(paths)}", "two photographs or more")
+    ratio = as_positive("ratio", ratio)
+    max_features = as_count("max_features", max_features, at_least=8)
+    listed = _listed(pairs, len(paths))
+    cv2, found = opencv(), []
+    for k, path in enumerate(paths):
+        if progress is not None:
+            progress("features", k, len(paths))
+        image = load_image(path)
+        x, descriptors = features(
+            cv2, seeker(cv2, detector, max_features), str(path), image, max_size, max_features
+        )
+        x, descriptors = _distinct(x, descriptors)
+        size = image.shape[1], image.shape[0]
+        found.append((size, x, _normalized(descriptors, detector), _colours(image, x)))
+    matched = {}
+    for k, (i, j) in enumerate(listed):
+        if progress is not None:
+            progress("pairs", k, len(listed))
+        matched[i, j] = _matched(found[i][2], found[j][2], ratio)
+    return PairwiseMatches(
+        _names(paths),
+        np.array([size for size, *_ in found]),
+        tuple(x for _, x, _, _ in found),
+        matched,
+        tuple(colours for *_, colours in found),
+    )
+
+
+def _names(paths: list[Path]) -> tuple[str, ...]:
+    """Return names without the part that all paths have in common."""
+    if len({path.name for path in paths}) == len(paths):
+        return tuple(path.name for path in paths)
+    root = os.path.commonpath([path.absolute().parent for path in paths])
+    return tuple(path.absolute().relative_to(root).as_posix() for path in paths)
+
+
+def _listed(pairs: str | Iterable[tuple[int, int]], n: int) -> list[tuple[int, int]]:
+    if isinstance(pairs, str):
+        if pairs not in ("all", "sequential"):
+            raise ArgumentError("pairs", f"is {pairs!r:.60}", "'all', 'sequential', or pairs")
+        most = n if pairs == "all" else 5
+        return [(i, j) for i, j in itertools.combinations(range(n), 2) if j - i <= most]
+    listed = sorted({(min(i, j), max(i, j)) for i, j in pairs})
+    bad = [pair for pair in listed if not 0 <= pair[0] < pair[1] < n]
+    if bad:
+        raise ArgumentError("pairs", f"names {bad[0]}", f"two different images from 0 to {n - 1}")
+    return listed
+
+
+def _distinct(x: Array, descriptors: NDArray[Any]) -> tuple[Array, NDArray[Any]]:
+    """Return features without further orientations of one place: two tracks would be one."""
+    first = np.sort(np.unique(np.round(x, 3), axis=0, return_index=True)[1])
+    return x[first], descriptors[first] if len(descriptors) == len(x) else descriptors
+
+
+def _normalized(descriptors: NDArray[Any], detector: str) -> NDArray[Any]:
+    """Return descriptors whose scalar products compare them: float32 (n, k)."""
+    if descriptors.dtype == np.uint8:  # bits: +-1, so that products count those in common
+        bits = 2.0 * np.unpackbits(descriptors, axis=1).astype(np.float32) - 1.0
+        return np.asarray(bits / np.sqrt(np.float32(max(bits.shape[1], 1))))
+    values = descriptors.astype(np.float32)
+    if detector == "sift":
+        values = np.sqrt(values / np.maximum(values.sum(axis=1, keepdims=True), 1e-12))
+    return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12))
+
+
+def _matched(a: NDArray[Any], b: NDArray[Any], ratio: float) -> Indices:
+    """Return rows that choose each other by a margin from both sides, (m, 2)."""
+    if min(len(a), len(b)) < 2 or a.shape[1] != b.shape[1]:
+        return np.zeros((0, 2), dtype=np.intp)
+    best_of_a, best_of_b = np.zeros(len(a), np.intp), np.zeros(len(b), np.intp)
+    first_b = np.full(len(b), -2.0, np.float32)
+    second_b = np.full(len(b), -2.0, np.float32)
+    clear = np.zeros(len(a), np.bool_)
+    limit = ratio**2
+    columns = np.arange(len(b))
+    for begin in range(0, len(a), _BLOCK):
+        products = a[begin : begin + _BLOCK] @ b.T
+        rows = np.arange(len(products))
+        best = products.argmax(axis=1)
+        top = products[rows, best].copy()
+        # Of the columns first: the rows' best are taken out below.
+        of_b = products.argmax(axis=0)
+        top_b = products[of_b, columns].copy()
+        products[of_b, columns] = -2.0
+        next_b = products.max(axis=0)
+        products[of_b, columns] = top_b
+        better = top_b > first_b
+        second_b = np.where(better, np.maximum(first_b, next_b), np.maximum(second_b, top_b))
+        best_of_b[better] = begin + of_b[better]
+        first_b = np.where(better, top_b, first_b)
+        products[rows, best] = -2.0
+        second = products.max(axis=1)
+        best_of_a[begin + rows] = best
+        # Squared distances of unit vectors: 2 - 2 a b.
+        clear[begin + rows] = 1.0 - top < limit * (1.0 - second)
+    clear_b = 1.0 - first_b < limit * (1.0 - second_b)
+    rows = np.arange(len(a))
+    rows = rows[clear & (best_of_b[best_of_a] == rows) & clear_b[best_of_a]]
+    return np.column_stack([rows, best_of_a[rows]])
+
+
+def _colours(image: Image, x: Array) -> NDArray[np.uint8]:
+    """Return the mean colour about each feature, (n, 3)."""
+    rgb = image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
+    height, width = rgb.shape[:2]
+    column, row = np.rint(x).astype(np.intp).T if len(x) else np.zeros((2, 0), np.intp)
+    total = np.zeros((len(x), 3))
+    for dy, dx in itertools.product(range(-_COLOUR, _COLOUR + 1), repeat=2):
+        total += rgb[np.clip(row + dy, 0, height - 1), np.clip(column + dx, 0, width - 1), :3]
+    return np.rint(total / (2 * _COLOUR + 1) ** 2).astype(np.uint8)

@@ -1,0 +1,154 @@
+"""Tracks from matches of pairs: verified, merged without contradictions, what is left out named."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import epigauge as eg
+import numpy as np
+import pytest
+from calibration import SIZE, tracks_of
+from epigauge.images.pairwise import _matched
+from epigauge.images.tracks import NoTracks, _united
+
+pytest.importorskip("cv2", reason="estimate_fundamental needs a front end")
+
+
+def pairwise(
+    motion: str = "general",
+    seed: int = 0,
+    *,
+    flat: bool = False,
+    unrelated: bool = False,
+    wrong: float = 0.2,
+    n: int = 5,
+) -> tuple[eg.PairwiseMatches, eg.Tracks]:
+    """Return matches of all pairs of a made-up scene, a share of them wrong, and its tracks."""
+    tracks, scene = tracks_of(motion, seed, n_views=n, n_points=160)
+    rng = np.random.default_rng(seed)
+    xy = tracks.xy
+    if flat:
+        X = scene.X * [1.0, 1.0, 0.0]
+        xy = eg.MetricReconstruction(scene.R, scene.t, X, scene.cameras).project(tracks)
+    xy = xy + rng.normal(0.0, 0.3, xy.shape)
+    points, pairs, number = [], {}, {}
+    for i in range(n):
+        rows = rng.permutation(np.flatnonzero(tracks.view == i))
+        points.append(xy[rows])
+        number[i] = dict(zip(tracks.point[rows].tolist(), range(len(rows)), strict=True))
+    if unrelated:
+        points.append(rng.uniform(0.0, 1.0, (160, 2)) * SIZE)
+        number[n] = dict(zip(range(160), rng.permutation(160).tolist(), strict=True))
+    for i, j in itertools.combinations(range(len(points)), 2):
+        common = sorted(number[i].keys() & number[j].keys())
+        rows = np.array([(number[i][k], number[j][k]) for k in common])
+        out = rng.random(len(rows)) < wrong
+        rows[out, 1] = rng.permutation(rows[out, 1])
+        pairs[i, j] = rows
+    names = tuple(f"{k}.jpg" for k in range(len(points)))
+    sizes = np.tile(SIZE, (len(points), 1))
+    colours = tuple(np.full((len(p), 3), (10, 20, 30), np.uint8) for p in points)
+    return eg.PairwiseMatches(names, sizes, tuple(points), pairs, colours), tracks
+
+
+def test_pairs_become_tracks_that_lead_to_the_camera() -> None:
+    matches, truth = pairwise()
+    tracks = eg.build_tracks(matches)
+    assert tracks.names == matches.names
+    assert tracks.source.left_out == {}
+    assert (tracks.colours == [10, 20, 30]).all()
+    # Long tracks come back whole: more observations than half of the right ones.
+    assert len(tracks) > 0.5 * len(truth)
+    found = eg.metric_upgrade(tracks, image_size=tracks.sizes)
+    assert found.success
+    assert abs(found.focal_px - 900.0) < 4.0 * found.focal_std_px
+
+
+def test_an_image_of_something_else_is_left_out() -> None:
+    matches, _ = pairwise(unrelated=True, n=3)
+    tracks = eg.build_tracks(matches)
+    assert tracks.names == matches.names[:3]
+    assert list(tracks.source.left_out) == ["3.jpg"]
+    assert "agrees with no other image" in tracks.source.left_out["3.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"flat": True}, "planar scene"),
+        ({"motion": "rotation"}, "pure rotation"),
+        ({"wrong": 1.0}, "nothing in common"),
+    ],
+)
+def test_what_cannot_start_a_scene_is_said(arguments: dict, words: str) -> None:
+    matches, _ = pairwise(n=3, **arguments)
+    with pytest.raises(NoTracks, match=words):
+        eg.build_tracks(matches)
+
+
+def test_no_track_has_two_features_of_one_image() -> None:
+    rng = np.random.default_rng(0)
+    image_of = np.repeat(np.arange(6), 40)
+    for _ in range(5):
+        edges = rng.integers(0, 240, (600, 2))
+        edges = edges[image_of[edges[:, 0]] != image_of[edges[:, 1]]]
+        track_of = _united(edges, image_of)
+        seen = {(t, i) for t, i in zip(track_of.tolist(), image_of.tolist(), strict=True) if t >= 0}
+        assert len(seen) == np.count_nonzero(track_of >= 0)
+        # What is joined without contradiction is one track: the first edge always.
+        assert track_of[edges[0, 0]] == track_of[edges[0, 1]] >= 0
+
+
+def test_a_file_begins_where_it_was_left(tmp_path: Path) -> None:
+    matches, _ = pairwise()
+    matches.save(tmp_path / "matches.npz")
+    again = eg.PairwiseMatches.load(tmp_path / "matches.npz")
+    assert again.names == matches.names
+    for one, other in zip(again.points, matches.points, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert again.pairs.keys() == matches.pairs.keys()
+    for pair, rows in matches.pairs.items():
+        np.testing.assert_array_equal(again.pairs[pair], rows)
+    (tmp_path / "broken.npz").write_bytes(b"PK")
+    with pytest.raises((eg.FileFormatError, OSError)):
+        eg.PairwiseMatches.load(tmp_path / "broken.npz")
+
+
+def test_matching_is_the_same_from_both_sides_and_in_any_blocks() -> None:
+    rng = np.random.default_rng(0)
+    a = rng.normal(size=(1300, 16)).astype(np.float32)
+    b = np.concatenate([a[rng.permutation(1300)[:900]], rng.normal(size=(500, 16))])
+    b = (b + 0.05 * rng.normal(size=b.shape)).astype(np.float32)
+    a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
+    rows = _matched(a, b, 0.8)
+    swapped = _matched(b, a, 0.8)
+    assert {tuple(r) for r in rows.tolist()} == {tuple(r[::-1]) for r in swapped.tolist()}
+    squared = 2.0 - 2.0 * (a @ b.T)
+    order = np.argsort(squared, axis=1)
+    expected = set()
+    for i in range(len(a)):
+        j, second = order[i, :2]
+        column = np.sort(squared[:, j])
+        clear = squared[i, j] < 0.64 * squared[i, second] and column[0] < 0.64 * column[1]
+        if clear and squared[i, j] == column[0]:
+            expected.add((i, int(j)))
+    assert {tuple(r) for r in rows.tolist()} == expected
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"sizes": np.ones((2, 2))}, "sizes"),
+        ({"points": ()}, "points"),
+        ({"pairs": {(1, 0): np.zeros((1, 2), int)}}, "pairs"),
+        ({"pairs": {(0, 1): np.full((1, 2), 10**6)}}, "pairs"),
+        ({"pairs": {(0, 1): np.zeros((1, 3), int)}}, "pairs"),
+    ],
+)
+def test_bad_matches_are_named(change: dict, named: str) -> None:
+    matches, _ = pairwise()
+    fields = {k: getattr(matches, k) for k in ("names", "sizes", "points", "pairs")} | change
+    with pytest.raises(eg.ArgumentError) as error:
+        eg.PairwiseMatches(**fields)
+    assert error.value.argument == named

@@ -1,0 +1,99 @@
+"""``epigauge scene``: everything in one folder, or a sentence and nothing at all."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import epigauge as eg
+import numpy as np
+import pytest
+from colmap_databases import Project
+
+pytest.importorskip("typer", reason="the command line needs typer")
+pytest.importorskip("rich", reason="the command line needs rich")
+pytest.importorskip("cv2", reason="photographs need OpenCV")
+
+from epigauge.__main__ import main
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Run the command line in this process: (exit code, stdout, stderr)."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["epigauge", *map(str, arguments)])
+        with pytest.raises(SystemExit) as caught:
+            main()
+        code = caught.value.code
+        return (0 if code is None else code, *capsys.readouterr())
+
+    return run
+
+
+def test_a_database_becomes_a_scene(run, tmp_path: Path) -> None:
+    database = Project(n_views=4, n_points=150).write(tmp_path / "database.db")
+    output = tmp_path / "scene"
+    code, _, err = run("scene", database, "-o", output)
+    assert code == 0, err
+    report = json.loads((output / "report.json").read_text())
+    assert report["photographs"] == ["1.jpg", "2.jpg", "3.jpg", "4.jpg"]
+    assert report["left_out"] == {}
+    # COLMAP counts from the corner of the first pixel: the same centre, half a pixel less.
+    assert abs(report["focal_px"] - 1000.0) < 4.0 * report["focal_std_px"]
+    for folder in ("sparse/0", "sparse_text"):
+        tracks, scene = eg.load_scene(output / folder)
+        assert scene.rms_px(tracks) < 1.0
+        assert tracks.names == ("1.jpg", "2.jpg", "3.jpg", "4.jpg")
+    assert "Focal length" in (output / "index.html").read_text()
+    assert (output / "points.ply").stat().st_size > 1000
+    assert not list(tmp_path.glob(".scene*"))
+    code, _, err = run("scene", database, "-o", output)
+    assert code == 2
+    assert "empty" in err
+
+
+def _poster(folder: Path, seed: int) -> list[Path]:
+    """Write three views of something flat."""
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    picture = cv2.GaussianBlur(rng.uniform(0.0, 255.0, (240, 320)), (0, 0), 1.2)
+    picture = cv2.normalize(picture, None, 0.0, 255.0, cv2.NORM_MINMAX).astype(np.uint8)
+    paths = []
+    for k in range(3):
+        H = np.eye(3) + rng.normal(0.0, 1.0, (3, 3)) * [
+            [0.05, 0.05, 5],
+            [0.05, 0.05, 5],
+            [3e-4, 3e-4, 0],
+        ]
+        paths.append(folder / f"{seed}_{k}.png")
+        cv2.imwrite(str(paths[-1]), cv2.warpPerspective(picture, H, (320, 240)))
+    return paths
+
+
+def test_what_is_no_scene_is_said_and_nothing_is_written(run, tmp_path: Path) -> None:
+    poster, other = _poster(tmp_path, 0), _poster(tmp_path, 1)
+    output = tmp_path / "scene"
+    code, _, err = run("scene", *poster, "-o", output)
+    assert code == 1
+    assert "no parallax" in err
+    code, _, err = run("scene", poster[0], other[0], "-o", output)
+    assert code == 1
+    assert "nothing in common" in err
+    assert not output.exists()
+    assert not list(tmp_path.glob(".scene*"))
+
+
+def test_bad_input_ends_with_two(run, tmp_path: Path) -> None:
+    output = tmp_path / "scene"
+    (tmp_path / "empty").mkdir()
+    assert run("scene", tmp_path / "empty", "-o", output)[0] == 2
+    assert run("scene", tmp_path / "no.jpg", tmp_path / "nor.jpg", "-o", output)[0] == 2
+    assert run("scene", tmp_path / "a.db", tmp_path / "b.jpg", "-o", output)[0] == 2
+    (tmp_path / "one.db").write_bytes(b"nothing")
+    assert run("scene", tmp_path / "one.db", "-o", output)[0] == 2
+    (poster, *_) = _poster(tmp_path, 0)
+    assert run("scene", poster, "-o", output)[0] == 2
+    assert run("scene", poster, poster, "--cameras", "two", "-o", output)[0] == 2
