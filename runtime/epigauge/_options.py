@@ -98,7 +98,7 @@ class PairOptions(TypedDict, total=False):
     xtol: float
     gtol: float
     max_iter: int
-    backend: Backend | None
+    backend: Backend | Literal["array"] | None
     callback: Callable[[Row], object] | None
 
 

@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Unpack
@@ -157,6 +157,7 @@ def refine_database(
     write: bool = False,
     backup: bool = True,
     workers: int = 1,
+    executor: Executor | None = None,
     progress: Callable[[int, int], object] | None = None,
     **options: Unpack[PairOptions],
 ) -> DatabaseResult:
@@ -177,6 +178,8 @@ def refine_database(
         Copy the database first, to a new file beside it.
     workers : int
         Threads. The results do not depend on it.
+    executor : concurrent.futures.Executor, optional
+        Where to refine, as of `refine_fundamental_batch`; the database is read and written here.
     progress : callable, optional
         Called as ``progress(done, n)`` after every pair, from the calling thread.
     **options
@@ -221,7 +224,8 @@ def refine_database(
         parts: list[dict[str, Any]] = []
         done = 0
         for pairs in database.pairs():
-            parts.append(_refined(pairs, workers, _shifted(progress, done, total), known))
+            told = _shifted(progress, done, total)
+            parts.append(_refined(pairs, workers, executor, told, known))
             done += len(pairs)
         result = _joined(parts, database.names())
         accepted = np.array([verdict == "refined" for verdict in result.verdict])
@@ -236,6 +240,7 @@ def refine_database(
 def _refined(
     pairs: VerifiedPairs,
     workers: int,
+    executor: Executor | None,
     progress: Callable[[int, int], object] | None,
     options: dict[str, Any],
 ) -> dict[str, Any]:
@@ -249,6 +254,7 @@ def _refined(
         pairs.offsets,
         np.array(starts),
         workers=workers,
+        executor=executor,
         progress=progress,
         flags=True,
         **options,

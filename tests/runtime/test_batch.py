@@ -1,5 +1,8 @@
 """Many pairs in one call give what one call a pair gives."""
 
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
+
 import epigauge as eg
 import numpy as np
 import pytest
@@ -141,3 +144,28 @@ def test_pairs_beyond_the_first_chunk_have_starts_weights_and_results_of_their_o
         assert (batch.status[k], batch.success[k]) == (single.status, single.success)
         assert batch.success[k] == (batch.status[k] > 0)
     assert not batch.success.all()
+
+
+@pytest.mark.parametrize("kind", [ThreadPoolExecutor, ProcessPoolExecutor])
+def test_an_executor_gives_the_same_batch(ragged, kind, monkeypatch):
+    x1, x2, offsets = ragged
+    monkeypatch.setattr(batch_module, "_PART", 2)
+    expected = eg.refine_fundamental_batch(x1, x2, offsets, flags=True)
+    done = []
+    context = {} if kind is ThreadPoolExecutor else {"mp_context": get_context("spawn")}
+    with kind(2, **context) as executor:
+        batch = eg.refine_fundamental_batch(
+            x1, x2, offsets, executor=executor, progress=lambda *counts: done.append(counts)
+        )
+    for name in ("F", "covariance", "distances", "rank", "nfev", "status", "success"):
+        np.testing.assert_array_equal(getattr(batch, name), getattr(expected, name), err_msg=name)
+    assert batch.flags == expected.flags
+    assert batch.reasons == expected.reasons
+    assert done == [(k + 1, len(SIZES)) for k in range(len(SIZES))]
+
+
+def test_what_is_no_executor_is_named(ragged):
+    with pytest.raises(eg.ArgumentError, match="submit"):
+        eg.refine_fundamental_batch(*ragged, executor=4)
+    with ThreadPoolExecutor(1) as executor, pytest.raises(eg.ArgumentError, match="callback"):
+        eg.refine_fundamental_batch(*ragged, executor=executor, callback=print)

@@ -117,7 +117,7 @@ class Search:
     ) -> None:
         self.sample, self.images, self.camera = sample, images, camera
         self.options: Any = {"workers": workers, "backend": backend}
-        self.backend = backend
+        self.backend: Any = backend
         #: Why there is no scene, where there is none.
         self.flags: tuple[str, ...] = ("undetermined",)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, Unpack
@@ -30,6 +30,9 @@ Array = NDArray[np.float64]
 
 #: Pairs that a thread refines at a time.
 _CHUNK = 64
+
+#: Pairs that go to an executor at a time: results travel back, so that there are more.
+_PART = 4 * _CHUNK
 
 #: Meaning of `FundamentalBatch.status`.
 BATCH_STATUS = lm.STATUS | {REFUSED: "the matches of this pair cannot determine F: see `reasons`"}
@@ -110,6 +113,7 @@ def refine_fundamental_batch(
     *,
     weights: ArrayLike | None = None,
     workers: int = 1,
+    executor: Executor | None = None,
     progress: Callable[[int, int], object] | None = None,
     flags: bool = False,
     **options: Unpack[PairOptions],
@@ -131,6 +135,10 @@ def refine_fundamental_batch(
         Factor of each match's squared distance.
     workers : int
         Threads. The results do not depend on it.
+    executor : concurrent.futures.Executor, optional
+        Where to refine, instead of threads of this process: a pool of threads or processes, Dask's
+        ``client.get_executor()``, or anything else with this interface. The results are the same;
+        covariances, flags and success are then computed there, too.
     progress : callable, optional
         Called as ``progress(done, n)`` after every pair, from the calling thread.
     flags : bool
@@ -153,7 +161,7 @@ def refine_fundamental_batch(
         options.
     """
     if arrays.is_tensor(x1) or options.get("backend") == "array":
-        found = _over_arrays(x1, x2, offsets, F0, weights, options)
+        found = _over_arrays(x1, x2, offsets, F0, weights, {**options})
         if flags:
             _ = found.flags  # computed when asked for
         return found
@@ -167,6 +175,8 @@ def refine_fundamental_batch(
         raise ArgumentError("F0", f"has shape {starts.shape}", f"({count}, 3, 3)")
     known = known_options("refine_fundamental_batch", options, PairOptions)
     _check_options(known)
+    if executor is not None:
+        return _elsewhere(executor, (x1, x2, bounds, starts, w), known, progress)
     work = _Work(x1, x2, bounds, starts, w, known)
     size = 1 if work.plan.native is None else _CHUNK
     chunks = [range(first, min(first + size, count)) for first in range(0, count, size)]
@@ -184,6 +194,59 @@ def refine_fundamental_batch(
             for future in futures:
                 future.cancel()
     return work.result(flags)
+
+
+def _elsewhere(
+    executor: Executor,
+    pairs: tuple[Array, Array, NDArray[np.intp], Array | None, Array | None],
+    options: dict[str, Any],
+    progress: Callable[[int, int], object] | None,
+) -> FundamentalBatch:
+    """Refine in parts wherever an executor has room, and join the results in order."""
+    x1, x2, bounds, starts, weights = pairs
+    count = len(bounds) - 1
+    if not callable(getattr(executor, "submit", None)):
+        needed = "one as of concurrent.futures: it has a method submit"
+        raise ArgumentError("executor", f"is of type {type(executor).__name__}", needed)
+    if options.get("callback") is not None:
+        raise ArgumentError("callback", "cannot be called from elsewhere", "none with an executor")
+    futures = {}
+    for first in range(0, max(count, 1), _PART):
+        last = min(first + _PART, count)
+        rows = slice(int(bounds[first]), int(bounds[last]))
+        futures[first] = executor.submit(
+            refine_fundamental_batch,
+            x1[rows],
+            x2[rows],
+            bounds[first : last + 1] - bounds[first],
+            None if starts is None else starts[first:last],
+            weights=None if weights is None else weights[rows],
+            flags=True,
+            **options,
+        )
+    parts, done = [], 0
+    try:
+        for first, future in futures.items():
+            parts.append(future.result())
+            for _ in range(min(_PART, count - first)):
+                done += 1
+                if progress is not None:
+                    progress(done, count)
+    finally:  # after an error or Ctrl-C, drop what has not begun
+        for future in futures.values():
+            future.cancel()
+    fields: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in FundamentalBatch.__dataclass_fields__
+        if name not in ("reasons", "flags")
+    }
+    reasons = {
+        first + k: reason
+        for first, part in zip(futures, parts, strict=True)
+        for k, reason in part.reasons.items()
+    }
+    flags = tuple(flags for part in parts for flags in part.flags)
+    return FundamentalBatch(**fields, reasons=reasons, flags=flags)
 
 
 def _as_offsets(offsets: ArrayLike, m: int) -> NDArray[np.intp]:
