@@ -57,15 +57,15 @@ struct eg_route {
     /* Evaluate a slot for `turn`, and for `observe`, which adds to the sums of points and cameras. */
     void (*evaluate)(eg_pass *);
     void (*observe)(eg_pass *, double *sums, double *cameras);
-    /* Evaluate a slot for the next two, which work on one of `count` columns: entries are `count` rows
-       of lanes apart. */
+    /* Evaluate a slot for the next two, of `count` columns; entries of one are `count` rows of lanes
+       apart, entries of cameras so many apart. */
     void (*couple)(const eg_pass *, const double *roots);
-    /* v += (W T)^T x for x of the cameras, (tangent, M). */
+    /* v += (W T)^T x of one column, x of the cameras, (tangent, M). */
     void (*to_points)(const eg_pass *, const double *roots, ptrdiff_t count, const double *x,
                       double *v);
-    /* cameras += W T v. */
+    /* cameras += W T v of all columns; `scratch` has two rows a column. */
     void (*to_cameras)(const eg_pass *, const double *roots, ptrdiff_t count, const double *v,
-                       double *cameras);
+                       double *scratch, double *cameras);
     /* Turn the factors W T of a chunk, what is kept of its first slot being at `kept`, into those of a
        group, behind what it has; cameras += W T v unless v is NULL. May add pairs on its own, and
        leave the group as it is. */

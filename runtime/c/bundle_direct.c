@@ -111,27 +111,44 @@ static void to_points(const eg_pass *p, const double *roots, ptrdiff_t count, co
 }
 
 static void to_cameras(const eg_pass *p, const double *roots, ptrdiff_t count, const double *v,
-                       double *cameras)
+                       double *moved, double *cameras)
 {
     const ptrdiff_t M = p->chunk.M, b = p->route->point, K = p->route->tangent;
     const ptrdiff_t d = eg_model_of(p)->tangent_size;
-    const double *J = p->work + 2 * M, *J_camera = J + 2 * b * M;
-    for (ptrdiff_t j = 0; j < p->filled; ++j) {
-        double *EG_RESTRICT camera = cameras + count * K * p->view[j];
-        double x = 0.0, y = 0.0;
+    const double *J = p->work + 2 * M, *J_camera = J + 2 * b * M, *EG_RESTRICT w = p->w;
+    double *EG_RESTRICT u = p->squared;
+    memset(moved, 0, (size_t)(2 * count * M) * sizeof *moved);
+    for (ptrdiff_t c = 0; c < count; ++c) { /* w J_point T v */
+        double *EG_RESTRICT x = moved + c * M, *EG_RESTRICT y = moved + (count + c) * M;
         for (ptrdiff_t l = 0; l < b; ++l) {
-            double moved = 0.0; /* (T v)_l */
-            for (ptrdiff_t k = 0; k < b; ++k)
-                moved += roots[(b * l + k) * M + j] * v[count * k * M + j];
-            x += J[l * M + j] * moved;
-            y += J[(b + l) * M + j] * moved;
-        }
-        x *= p->w[j], y *= p->w[j];
-        for (ptrdiff_t k = 0; k < K; ++k) {
-            const double *entry = J_camera + p->bundle->columns[k] * M + j;
-            camera[count * k] += entry[0] * x + entry[d * M] * y;
+            const double *EG_RESTRICT first = J + l * M, *EG_RESTRICT second = J + (b + l) * M;
+            for (ptrdiff_t k = 0; k < b; ++k) {
+                const double *EG_RESTRICT T = roots + (b * l + k) * M;
+                const double *EG_RESTRICT own = v + (count * k + c) * M;
+                EG_SIMD
+                for (ptrdiff_t j = 0; j < M; ++j)
+                    u[j] = k ? u[j] + T[j] * own[j] : T[j] * own[j];
+            }
+            EG_SIMD
+            for (ptrdiff_t j = 0; j < M; ++j)
+                x[j] += w[j] * first[j] * u[j], y[j] += w[j] * second[j] * u[j];
         }
     }
+    for (ptrdiff_t j = 0; j < p->filled; ++j)
+        for (ptrdiff_t begin = 0; begin < count; begin += 8) {
+            const ptrdiff_t some = count - begin < 8 ? count - begin : 8;
+            double *EG_RESTRICT camera = cameras + count * K * p->view[j] + begin;
+            double x[8], y[8];
+            for (ptrdiff_t c = 0; c < some; ++c) {
+                x[c] = moved[(begin + c) * M + j];
+                y[c] = moved[(count + begin + c) * M + j];
+            }
+            for (ptrdiff_t k = 0; k < K; ++k, camera += count) {
+                const double *entry = J_camera + p->bundle->columns[k] * M + j;
+                for (ptrdiff_t c = 0; c < some; ++c)
+                    camera[c] += entry[0] * x[c] + entry[d * M] * y[c];
+            }
+        }
 }
 
 static void turn(eg_pass *p, const double *roots, const double *v, double *kept,

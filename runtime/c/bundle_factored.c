@@ -106,20 +106,23 @@ static void add_to_cameras(const eg_pass *p, const double *F, const double *v, d
 }
 
 static void to_cameras(const eg_pass *p, const double *roots, ptrdiff_t count, const double *v,
-                       double *cameras)
+                       double *scratch, double *cameras)
 {
-    (void)roots;
+    (void)roots, (void)scratch;
     const ptrdiff_t M = p->chunk.M;
     const double *F = p->work + 10 * M;
     if (count == 1) {
         add_to_cameras(p, F, v, cameras);
         return;
     }
-    const double *y = moved_by(p, F, count * M, v);
-    for (ptrdiff_t j = 0; j < p->filled; ++j)
-        for (int a = 0; a < 3; ++a)
-            for (int k = 0; k < 4; ++k)
-                cameras[count * (12 * p->view[j] + 4 * a + k)] += y[a * M + j] * p->points[k * M + j];
+    for (ptrdiff_t c = 0; c < count; ++c) {
+        const double *y = moved_by(p, F, count * M, v + c * M);
+        for (ptrdiff_t j = 0; j < p->filled; ++j)
+            for (int a = 0; a < 3; ++a)
+                for (int k = 0; k < 4; ++k)
+                    cameras[count * (12 * p->view[j] + 4 * a + k) + c] +=
+                        y[a * M + j] * p->points[k * M + j];
+    }
 }
 
 /* Lanes that hold a point, where all of these are seen by the same views, once; else 0. */

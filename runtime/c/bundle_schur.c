@@ -150,7 +150,7 @@ int eg_bundle_couple(
     const eg_route route = eg_route_of(bundle);
     const ptrdiff_t b = route.point, a = route.tangent;
     eg_pass p;
-    if (eg_pass_begin(&p, bundle, &route, begin, end, (a + b) * count + b * b, 0))
+    if (eg_pass_begin(&p, bundle, &route, begin, end, ((a > 2 ? a : 2) + b) * count + b * b, 0))
         return 1;
     for (ptrdiff_t c = begin; c < end; ++c) {
         eg_pass_chunk(&p, c, points);
@@ -175,8 +175,7 @@ int eg_bundle_couple(
         for (ptrdiff_t s = 0; reduced && s < p.chunk.L; ++s) {
             eg_pass_slot(&p, s, cameras);
             route.couple(&p, roots);
-            for (ptrdiff_t k = 0; k < count; ++k)
-                route.to_cameras(&p, roots, count, v + k * M, reduced + k);
+            route.to_cameras(&p, roots, count, v, gathered, reduced);
         }
     }
     eg_release(p.memory);

@@ -15,7 +15,7 @@ from epigauge.bundle.similarity import Similarity
 from epigauge.cameras import MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.uncertainty.datum import Projection, projection
-from epigauge.uncertainty.inverse import Inverse, Part
+from epigauge.uncertainty.inverse import Inverse, Part, spread
 from epigauge.uncertainty.sandwich import Sandwich
 
 __all__ = ["MetricCovariance", "Std"]
@@ -301,18 +301,20 @@ class MetricCovariance(Result):
         d = self._inverse.sizes[1]
         low, middle = self._projection, self._projection.M
         blocks, points = self._inverse.diagonals
-        blocks = blocks + low.cameras @ middle @ np.swapaxes(low.cameras, 1, 2)
-        points = points + low.points @ middle @ np.swapaxes(low.points, 1, 2)
+        blocks = spread(blocks, low.cameras, middle)
+        points = spread(points, low.points, middle)
         poses = (
             self.noise_px**2
             * self._poses
             @ blocks[:, :_POSE, :_POSE]
             @ np.swapaxes(self._poses, 1, 2)
         )
-        turned = self._space @ points @ self._space.T
+        # The diagonal of S X S^T, X the covariance of a point.
+        both = self._space[:, :, None] * self._space[:, None, :]
+        turned = points.reshape(-1, 9) @ both.reshape(3, 9).T
         cameras = self.reconstruction.cameras
         first = np.unique(cameras.camera_of_view, return_index=True)[1]
-        of_points = np.sqrt(np.maximum(self.noise_px**2 * np.einsum("mii->mi", turned), 0.0))
+        of_points = np.sqrt(np.maximum(self.noise_px**2 * turned, 0.0))
         of_points[self._inverse.at_infinity] = np.inf
         own = np.einsum("nii->ni", blocks)[first, _POSE:d] * self.noise_px**2
         of_poses = np.sqrt(np.maximum(np.einsum("nii->ni", poses), 0.0))

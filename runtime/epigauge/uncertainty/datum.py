@@ -21,7 +21,7 @@ from epigauge.multi_view.gauge import (
     reference_camera,
     two_cameras,
 )
-from epigauge.uncertainty.inverse import Inverse, products
+from epigauge.uncertainty.inverse import Inverse, combined, products
 from epigauge.uncertainty.sandwich import Sandwich
 
 __all__ = ["Datum", "Projection", "projection"]
@@ -88,7 +88,7 @@ def projection(
         )
     # K = (C G)^-1 C: S = I - G K.
     back = np.linalg.inv(product).T
-    K = C[0] @ back, C[1] @ back
+    K = combined(C[0], back), combined(C[1], back)
     T = inverse.apply(*K)
     R = products(K, T)
     L = np.concatenate([G[0], T[0]], axis=2), np.concatenate([G[1], T[1]], axis=2)

@@ -103,7 +103,7 @@ class Motions:
 
     def along(self, chosen: Array) -> tuple[Array, Array]:
         """Return motions (n, d, k) and (m, 3, k) of combinations (7, k)."""
-        return self.cameras @ chosen, self.points @ chosen
+        return combined(self.cameras, chosen), combined(self.points, chosen)
 
     def lifted(self, system: BundleSystem) -> Array:
         """Return F (n, d, f + h): as heavy along a motion as the images across it.
@@ -117,6 +117,17 @@ class Motions:
     def weights(system: BundleSystem) -> Array:
         """Return how much the images make of an entry of a tangent, on average, (d, 1)."""
         return np.asarray(np.einsum("nii->ni", system.normal.U).mean(axis=0)[:, None])
+
+
+def combined(columns: Array, mixing: Array) -> Array:
+    """Return combinations (n, d, l) of columns (n, d, k), as one product."""
+    n, d, k = columns.shape
+    return np.asarray(columns.reshape(n * d, k) @ mixing).reshape(n, d, mixing.shape[1])
+
+
+def spread(blocks: Array, L: Array, M: Array) -> Array:
+    """Return blocks (n, d, d) with L M L^T added, for L (n, d, q)."""
+    return blocks + combined(L, M) @ np.swapaxes(L, 1, 2) if L.shape[2] else blocks
 
 
 def _rows(rows: Array, motions: Array) -> Array:
@@ -291,9 +302,8 @@ class Inverse:
     def diagonals(self) -> tuple[Array, Array]:
         """The diagonal blocks of X of cameras (n, d, d) and points (m, 3, 3)."""
         points = self.coupling.marginals(self.T, self.blocks, coupled=False)[0]
-        both = (self.blocks.diagonal, self.L_cameras), (points, self.L_points)
-        of_views, of_points = (X + L @ self.M @ np.swapaxes(L, 1, 2) for X, L in both)
-        return of_views, of_points
+        views = spread(self.blocks.diagonal, self.L_cameras, self.M)
+        return views, spread(points, self.L_points, self.M)
 
     def _views(self, i: int, k: int) -> Array:
         """Return the block of X_0 of two views, (d, d)."""
