@@ -50,6 +50,45 @@ def banded(
     return eg.Tracks(view, point, xy, n_views=n), start
 
 
+def street(
+    n: int = 372, m: int = 50_000, seen: float = 4.3, most: int = 40, seed: int = 0
+) -> tuple[eg.Tracks, eg.MetricReconstruction]:
+    """Return what a vehicle sees on its way, a camera of its own each metre, as BAL's Ladybug sets.
+
+    Tracks of consecutive views have geometric lengths from two on, so many on average; noise of
+    half a pixel; the reconstruction is the truth.
+    """
+    rng = np.random.default_rng(seed)
+    heading = np.cumsum(0.03 * rng.standard_normal(n))
+    forward = np.column_stack([np.sin(heading), np.zeros(n), np.cos(heading)])
+    centres = np.cumsum(forward, axis=0)
+    right = np.column_stack([np.cos(heading), np.zeros(n), -np.sin(heading)])
+    down = np.broadcast_to([0.0, 1.0, 0.0], (n, 3))
+    # BAL's cameras look along -z, with y upwards.
+    R = np.stack([right, -down, -forward], axis=1)
+    t = -np.einsum("nij,nj->ni", R, centres)
+    length = np.minimum(1 + rng.geometric(1.0 / (seen - 1.0), m), min(most, n))
+    first = (rng.random(m) * (n - length + 1)).astype(np.intp)
+    last = first + length - 1
+    ahead, side, high = (
+        rng.uniform(4.0, 20.0, m),
+        rng.uniform(3.0, 10.0, m),
+        rng.normal(0.0, 2.0, m),
+    )
+    side *= rng.choice([-1.0, 1.0], m)
+    X = centres[last] + ahead[:, None] * forward[last] + side[:, None] * right[last]
+    X = X + high[:, None] * down[last]
+    point = np.repeat(np.arange(m), length)
+    view = np.arange(len(point)) - np.repeat(np.cumsum(length) - length, length) + first[point]
+    params = np.column_stack(
+        [rng.uniform(480.0, 520.0, n), rng.normal(-0.02, 0.005, n), rng.normal(0.0, 1e-3, n)]
+    )
+    scene = eg.MetricReconstruction(R, t, X, eg.Cameras("bal", params, np.arange(n)))
+    tracks = eg.Tracks(view, point, np.zeros((len(view), 2)))
+    xy = scene.project(tracks) + rng.normal(0.0, 0.5, (len(view), 2))
+    return eg.Tracks(tracks.view, tracks.point, xy), scene
+
+
 def papers() -> Problem:
     """Return the scene of Bartoli 2003: five views, a hundred points, registered in turn."""
     tracks = eg.multi_view_scene().tracks

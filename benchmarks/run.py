@@ -20,6 +20,7 @@ SCRIPTS = {
     "kernels.py": ["--quick"],
     "many_views.py": ["--quick"],
     "metric_views.py": ["--runs", "1"],
+    "covariances.py": ["--runs", "1"],
     "sequences.py": ["--quick"],
     "imports.py": ["--runs", "3"],
 }
@@ -30,6 +31,7 @@ TABLES: dict[str, list[str]] = {
     "kernels.py": [],
     "many_views.py": ["--plot", "growth.png"],
     "metric_views.py": [],
+    "covariances.py": [],
     "sequences.py": [],
     "imports.py": [],
 }
