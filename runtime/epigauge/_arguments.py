@@ -81,6 +81,7 @@ def as_matches(
         row is named), none beyond 1e-70, a type that is not a real number, fewer than `at_least`
         matches and, with `general_position`, points without extent in two dimensions.
     """
+    x1, x2 = on_host("x1", x1), on_host("x2", x2)
     a1, a2 = _points("x1", x1), _points("x2", x2)
     if len(a1) != len(a2):
         raise ArgumentError(
@@ -421,8 +422,30 @@ def _is_spread(points: Array, eps: float) -> bool:
     )
 
 
+def on_host(name: str, value: Any) -> Any:
+    """Return a tensor of PyTorch or CuPy, or a nullable table of pandas, as an array.
+
+    Everything else, JAX, TensorFlow, xarray, polars among it, NumPy converts itself. None of them
+    is imported.
+    """
+    if isinstance(value, np.ndarray | list | tuple | int | float):
+        return value
+    try:
+        if hasattr(value, "detach") and hasattr(value, "cpu"):
+            return value.detach().cpu().numpy()
+        if hasattr(value, "__cuda_array_interface__") and hasattr(value, "get"):
+            return value.get()
+        if hasattr(value, "to_numpy") and np.asarray(value).dtype.hasobject:
+            return value.to_numpy(dtype=np.float64, na_value=np.nan)
+    except (TypeError, ValueError, RuntimeError) as error:
+        was = f"is a {type(value).__name__} that is no array"
+        raise ArgumentError(name, was, f"numbers of a usual type ({error})") from None
+    return value
+
+
 def as_array(name: str, value: ArrayLike, needed: str) -> NDArray[Any]:
     """Convert to an array of whatever type, refusing ragged lists and masked entries."""
+    value = on_host(name, value)
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         raise ArgumentError(name, "is a masked array", f"{needed} without masked entries")
     try:

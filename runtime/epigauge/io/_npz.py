@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -90,29 +91,49 @@ def read_every_array(path: Path, file: IO[bytes]) -> dict[str, NDArray[Any]]:
         }
 
 
+def read_npy(path: Path, file: IO[bytes]) -> NDArray[Any]:
+    """Read an NPY file of numbers, having checked its type and size before allocating it.
+
+    Raises
+    ------
+    FileFormatError
+        If it is none, or larger than it may be.
+    """
+    with damage(path, "is not a readable NPY file"):
+        size = file.seek(0, os.SEEK_END)
+        file.seek(0)
+        return _values(path, path.stem, file, size, _NUMBERS)
+
+
 def _read_npy(
     path: Path, archive: zipfile.ZipFile, member: str, types: re.Pattern[str] = _NUMBERS
 ) -> NDArray[Any]:
     """Read one array, having checked its declared type and size before allocating it."""
     name = member.removesuffix(".npy")
     with damage(path, f"array {name} is damaged"), archive.open(member) as stream:
-        shape, by_columns, dtype = _read_header(path, name, stream, types)
-        if not all(0 <= side <= MAX_MATCHES for side in shape) or math.prod(shape) > _MAX_VALUES:
-            raise FileFormatError(
-                path, f"array {name} has shape {cut(shape)}, needed: at most {MAX_MATCHES} rows"
-            )
-        size = math.prod(shape) * dtype.itemsize
-        declared = archive.getinfo(member).file_size
-        if size > declared:
-            raise FileFormatError(
-                path, f"array {name} is cut short: {size} bytes of data in a member of {declared}"
-            )
-        data = stream.read(size)
-        # Reading on to the end of the member makes zipfile check its sum.
-        if len(data) != size or stream.read(1):
-            raise FileFormatError(path, f"array {name} has not the size that its header declares")
-        values = np.frombuffer(data, dtype=dtype)
-        return values.reshape(shape, order="F" if by_columns else "C")
+        return _values(path, name, stream, archive.getinfo(member).file_size, types)
+
+
+def _values(
+    path: Path, name: str, stream: IO[bytes], declared: int, types: re.Pattern[str]
+) -> NDArray[Any]:
+    """Read header and values of an array in a stream of so many bytes."""
+    shape, by_columns, dtype = _read_header(path, name, stream, types)
+    if not all(0 <= side <= MAX_MATCHES for side in shape) or math.prod(shape) > _MAX_VALUES:
+        raise FileFormatError(
+            path, f"array {name} has shape {cut(shape)}, needed: at most {MAX_MATCHES} rows"
+        )
+    size = math.prod(shape) * dtype.itemsize
+    if size > declared:
+        raise FileFormatError(
+            path, f"array {name} is cut short: {size} bytes of data in a member of {declared}"
+        )
+    data = stream.read(size)
+    # Reading on to the end of the member makes zipfile check its sum.
+    if len(data) != size or stream.read(1):
+        raise FileFormatError(path, f"array {name} has not the size that its header declares")
+    values = np.frombuffer(data, dtype=dtype)
+    return values.reshape(shape, order="F" if by_columns else "C")
 
 
 def _read_header(

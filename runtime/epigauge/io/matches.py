@@ -13,7 +13,8 @@ from epigauge._arguments import as_matches, as_weights
 from epigauge._results import Result
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._common import PathLike, check_suffix, cut
-from epigauge.io._npz import read_npz, write_npz
+from epigauge.io._match_arrays import GROUPS, LINKS, MARKS, points_of, read_hdf5
+from epigauge.io._npz import read_npy, read_npz, write_npz
 from epigauge.io._text import Columns, read_text
 from epigauge.io.output import writing
 
@@ -77,17 +78,28 @@ class Matches(Result):
         return rows | ({} if marked is None else {"marked": marked})
 
 
-def load_matches(path: PathLike, inliers: bool = False) -> Matches:
-    """Read point matches from a CSV, TXT or NPZ file.
+def load_matches(
+    path: PathLike,
+    inliers: bool = False,
+    *,
+    features: PathLike | None = None,
+    pair: tuple[str, str] | None = None,
+) -> Matches:
+    """Read point matches from a CSV, TXT, NPZ, NPY or HDF5 file.
 
-    Text (every suffix but ``.npz``): one match a line, columns separated by commas, semicolons or
+    Text (every other suffix): one match a line, columns separated by commas, semicolons or
     white space, ``#`` starts a comment. Either four columns x1, y1, x2, y2, or a first line with
     the names of the columns: these four in any order, optionally ``weight`` and ``inlier`` (0 or
     1); other columns are ignored. A comment that holds nothing but these names is obeyed too.
 
     NPZ: arrays ``x1`` and ``x2`` (m, 2), or ``matches`` (m, 4) with columns x1, y1, x2, y2;
     optionally ``weights`` (m,), ``inlier`` (m,), ``image_size1`` and ``image_size2`` (width,
-    height). Other arrays are not looked at.
+    height). Or the arrays of other programs: ``mkpts0`` and ``mkpts1`` (LoFTR), ``keypoints0`` and
+    ``keypoints1`` with ``matches`` (k, 2) (LightGlue), ``matches0`` or ``matches`` (n,)
+    (SuperGlue) or as they are (kornia), ``pts1`` and ``pts2`` (OpenCV). Other arrays are not looked
+    at, confidences neither: they are no inverse variances.
+
+    NPY: one array (m, 4), or (2, m, 2). HDF5 (``.h5``, ``.hdf5``): the matches of hloc.
 
     Parameters
     ----------
@@ -95,6 +107,10 @@ def load_matches(path: PathLike, inliers: bool = False) -> Matches:
         The file.
     inliers : bool
         Keep only the matches that the file marks as inliers.
+    features : str or path, optional
+        With HDF5, the file of the keypoints that the matches refer to.
+    pair : tuple of str, optional
+        With HDF5, names of both images; not needed where the file holds one pair.
 
     Returns
     -------
@@ -106,13 +122,36 @@ def load_matches(path: PathLike, inliers: bool = False) -> Matches:
     FileFormatError
         If the file does not hold matches in this form, or more than `MAX_MATCHES` of them, or no
         inlier marks although `inliers` asks for them.
+    ArgumentError
+        If `features` or `pair` are given without HDF5, or missing with it.
+    MissingPackageError
+        If HDF5 is to be read without h5py.
     OSError
         If the file cannot be read.
+
+    Notes
+    -----
+    Pixels are taken as they are. Most of these programs have (0, 0) in the middle of the first
+    pixel, as OpenCV; COLMAP has (0.5, 0.5) there (`epigauge.interop.move_points`).
+
+    Examples
+    --------
+    >>> eg.load_matches("lightglue.npz")  # doctest: +SKIP
+    >>> pair = ("a.jpg", "b.jpg")
+    >>> eg.load_matches("m.h5", features="f.h5", pair=pair)  # doctest: +SKIP
     """
     path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".h5", ".hdf5") and (features is not None or pair is not None):
+        name = "pair" if features is None else "features"
+        raise ArgumentError(name, f"is given for {path.name!r:.60}", "None, or a file of HDF5")
     with path.open("rb") as file:
-        if path.suffix.lower() == ".npz":
+        if suffix == ".npz":
             fields = _from_npz(path, file, inliers)
+        elif suffix == ".npy":
+            fields = _from_npy(path, file)
+        elif suffix in (".h5", ".hdf5"):
+            fields = read_hdf5(path, file, None if features is None else Path(features), pair)
         else:
             fields = _from_text(path, file, inliers)
     return _matches(path, fields, inliers)
@@ -161,14 +200,18 @@ def save_matches(path: PathLike, matches: Matches) -> None:
 
 def _from_npz(path: Path, file: IO[bytes], inliers: bool) -> dict[str, Any]:
     """Read the arrays of an NPZ file."""
-    optional = ["weights", "image_size1", "image_size2", "inlier"]
-    found: dict[str, Any] = read_npz(path, file, [("x1", "x2"), ("matches",)], optional)
-    if "matches" in found:
-        table = found.pop("matches")
-        if table.ndim != 2 or table.shape[1] != 4:
-            raise FileFormatError(path, f"matches has shape {table.shape}, needed: (m, 4)")
-        found["x1"], found["x2"] = table[:, 0:2], table[:, 2:4]
-    return found
+    own = ("weights", "image_size1", "image_size2")
+    found = read_npz(path, file, GROUPS, (*own, *MARKS, *LINKS))
+    kept = {name: found[name] for name in own if name in found}
+    return kept | points_of(path, found)
+
+
+def _from_npy(path: Path, file: IO[bytes]) -> dict[str, Any]:
+    """Read the points of both images as one array."""
+    array = read_npy(path, file)
+    if array.ndim == 3 and array.shape[0] == 2 and array.shape[2] == 2:
+        array = np.concatenate([array[0], array[1]], axis=1)
+    return points_of(path, {"matches": array})
 
 
 def _from_text(path: Path, file: IO[bytes], inliers: bool) -> dict[str, Any]:

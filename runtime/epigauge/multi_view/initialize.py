@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from epigauge import lm
 from epigauge._arguments import as_choice, as_count
-from epigauge._options import Backend, Initialization
+from epigauge._options import Initialization
 from epigauge.bundle.dampings import Covariant
 from epigauge.bundle.moves import best_conditioned
 from epigauge.bundle.observations import ObservationGraph
@@ -45,7 +45,7 @@ def initialize(
     incremental: bool = False,
     robust: bool = False,
     seed: int = 0,
-    backend: Backend | None = None,
+    backend: str | None = None,
 ) -> Reconstruction:
     """Reconstruct without a start, well enough for `bundle_adjust` to begin from.
 
