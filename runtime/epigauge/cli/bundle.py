@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -333,7 +334,9 @@ class _Answer:
             self.model = pinhole_model(found, tracks, frame=self.frame)
         except ArgumentError as error:
             return error
-        names = [f"view{number:04d}" for number in self.file.views.tolist()]
+        names: Sequence[str] = [f"view{number:04d}" for number in self.file.views.tolist()]
+        if tracks.names is not None and all(name.split() == [name] for name in tracks.names):
+            names = tracks.names
         save_colmap_model(directory, self.model, tracks, names=names)
         return None
 

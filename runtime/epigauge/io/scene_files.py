@@ -9,12 +9,15 @@ from numpy.typing import NDArray
 
 from epigauge._arguments import as_choice
 from epigauge.cameras import MetricReconstruction
+from epigauge.cameras.bal import colmap_to_bal
 from epigauge.errors import ArgumentError
 from epigauge.io._bal import read_bal, write_bal
+from epigauge.io._bundler import read_bundler, write_bundler
 from epigauge.io._colmap_folder import read_folder, write_folder
 from epigauge.io._colmap_parts import ColmapModel
 from epigauge.io._colmap_scene import model_of, raw_scene
 from epigauge.io._common import PathLike
+from epigauge.io._exports import write_gltf, write_transforms
 from epigauge.io._npz_scene import is_npz_scene, read_npz_scene, write_npz_scene
 from epigauge.io._scene import RawScene, SceneSource, finished
 from epigauge.io.output import writing
@@ -41,7 +44,8 @@ def load_scene(
     text; with ``rigs`` and ``frames`` of COLMAP 3.12 and later, these have the poses. Pixels stay
     COLMAP's, with (0.5, 0.5) in the middle of the first one. A file ``.txt``, ``.txt.bz2`` or
     ``.txt.gz`` is a problem of "Bundle Adjustment in the Large", its cameras of the model ``bal``.
-    ``.npz`` is what `save_scene` writes.
+    ``.out`` is Bundler's, with the names of the images in ``list.txt`` beside it, its cameras of
+    the model ``bal``. ``.npz`` is what `save_scene` writes.
 
     Parameters
     ----------
@@ -92,9 +96,14 @@ def load_scene(
         raw = read_npz_scene(path)
     elif path.suffix.lower() in _BAL:
         raw = _read_bal(path)
+    elif path.suffix.lower() == ".out":
+        with path.open("rb") as file:
+            raw = read_bundler(path, file)
     else:
         was = f"is {str(path)!r}" if path.exists() else f"is {str(path)!r}, which does not exist"
-        raise ArgumentError("path", was, f"a COLMAP folder, or a name ending in .npz, {_listed()}")
+        raise ArgumentError(
+            "path", was, f"a COLMAP folder, or a name ending in .npz, .out, {_listed()}"
+        )
     return finished(path, raw, repeated, weak)
 
 
@@ -111,8 +120,11 @@ def save_scene(
     Parameters
     ----------
     path : str or path
-        ``.npz`` holds everything; ``.txt``, ``.txt.bz2`` or ``.txt.gz`` is a BAL problem; another
-        name without these suffixes is a COLMAP folder, which is made if absent.
+        ``.npz`` holds everything; ``.txt``, ``.txt.bz2`` or ``.txt.gz`` is a BAL problem; ``.out``
+        is Bundler's, with names in ``NAME.list.txt``; another name without these suffixes is a
+        COLMAP folder, which is made if absent. For other programs and not to be read again:
+        ``.glb`` (glTF: coloured points and cameras, for any viewer), ``.json``
+        (``transforms.json`` of NeRF programs).
     tracks : Tracks
         Observations. Those of `load_scene` keep COLMAP's numbers of images, cameras and points, its
         features without points, rigs and frames.
@@ -140,7 +152,10 @@ def save_scene(
     """
     path = Path(path)
     content = scene_content(path, tracks, reconstruction, rigs)
-    if content is None:
+    export = None if path.is_dir() else _EXPORTS.get(path.suffix.lower())
+    if export is not None:
+        export(path, tracks, reconstruction)
+    elif content is None:
         write_npz_scene(path, tracks, reconstruction)
     elif isinstance(content, ColmapModel):
         write_folder(path, content, text)
@@ -166,19 +181,33 @@ def scene_content(
         raise ArgumentError("reconstruction", was, needed)
     if not is_scene_file(path):
         return model_of(tracks, reconstruction, rigs)
-    if path.suffix.lower() == ".npz":
+    if path.suffix.lower() in (".npz", *_EXPORTS):
         return None
     return _nine_numbers(tracks, reconstruction)
 
 
 def is_scene_file(path: Path) -> bool:
     """Tell whether a scene is written to a path as one file, BAL or NPZ, not as COLMAP's folder."""
-    return not path.is_dir() and path.suffix.lower() in (".npz", *_BAL)
+    return not path.is_dir() and path.suffix.lower() in (".npz", *_EXPORTS, *_BAL)
 
 
 def is_scene(path: Path) -> bool:
     """Tell whether a path is a scene with cameras of a known model and nothing else."""
-    return path.is_dir() or (path.suffix.lower() == ".npz" and is_npz_scene(path))
+    suffix = path.suffix.lower()
+    return path.is_dir() or suffix == ".out" or (suffix == ".npz" and is_npz_scene(path))
+
+
+def _save_bundler(path: Path, tracks: Tracks, reconstruction: MetricReconstruction) -> None:
+    """Write a scene of BAL's or COLMAP's radial cameras as Bundler's."""
+    if (tracks.weights != 1.0).any():
+        raise ArgumentError("tracks.weights", "are not all one", "ones; NPZ keeps them")
+    own = reconstruction.cameras.model == "bal"
+    moved, scene = (tracks, reconstruction) if own else colmap_to_bal(tracks, reconstruction)
+    write_bundler(path, tracks, moved.xy, scene)
+
+
+#: Forms that are written for other programs; of them only Bundler's is read, too.
+_EXPORTS = {".glb": write_gltf, ".json": write_transforms, ".out": _save_bundler}
 
 
 def _listed() -> str:

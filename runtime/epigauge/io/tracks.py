@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._bal import nine_numbers, projective_cameras, read_bal, write_bal
 from epigauge.io._common import MAX_MATCHES, PathLike, check_suffix, listed
 from epigauge.io._npz import read_npz, write_npz
+from epigauge.io._opensfm import HEAD as OPENSFM
+from epigauge.io._opensfm import read_opensfm
 from epigauge.io._text import Columns, read_text
 from epigauge.io.output import writing
 from epigauge.multi_view.labels import view_names
@@ -63,6 +65,7 @@ def load_tracks(
     views: Iterable[int] | None = None,
     *,
     prune: str | None = None,
+    image_size: ArrayLike | None = None,
 ) -> Tracks:
     """Read tracks from an NPZ, CSV or BAL file.
 
@@ -73,6 +76,8 @@ def load_tracks(
     and are then sorted by them; numbers may begin anywhere and have gaps: both are kept in
     ``tracks.names``.
     BAL (``.txt``, ``.txt.bz2``, ``.txt.gz``): the observations.
+    OpenSfM's ``tracks.csv``: pixels as OpenCV counts them, from the sizes of the images in
+    ``exif/NAME.exif`` beside it or from `image_size`.
 
     Parameters
     ----------
@@ -85,6 +90,9 @@ def load_tracks(
     prune : {"first", "best", "drop"}, optional
         Drop views and points with too few observations, and of a point measured several times in
         one view keep the first, the best or none, as `Tracks.pruned` does.
+
+    image_size : array_like of int, shape (2,), optional
+        Width and height of all images of OpenSfM's tracks, where their project does not tell.
 
     Returns
     -------
@@ -99,7 +107,9 @@ def load_tracks(
     OSError
         If the file cannot be read.
     """
-    return load_track_file(path, clean, views, prune=prune, with_start=False).tracks
+    return load_track_file(
+        path, clean, views, prune=prune, with_start=False, image_size=image_size
+    ).tracks
 
 
 def load_track_file(
@@ -109,6 +119,7 @@ def load_track_file(
     *,
     prune: str | None = None,
     with_start: bool = True,
+    image_size: ArrayLike | None = None,
 ) -> TrackFile:
     """Read tracks, the reconstruction that comes with them, and the numbers they had in the file.
 
@@ -125,6 +136,8 @@ def load_track_file(
         one view keep the first, the best or none, as `Tracks.pruned` does.
     with_start : bool
         Read the reconstruction too, where there is one.
+    image_size : array_like of int, shape (2,), optional
+        As for `load_tracks`.
 
     Returns
     -------
@@ -137,7 +150,7 @@ def load_track_file(
         As for `load_tracks`.
     """
     path = Path(path)
-    found = _read(path, with_start)
+    found = _read(path, with_start, image_size)
     if "view" not in found:
         raise FileFormatError(path, "holds a reconstruction but no tracks: view, point and xy")
     view, point, xy = check_observations(path, found)
@@ -157,6 +170,8 @@ def load_track_file(
     except ArgumentError as error:
         raise FileFormatError(path, str(error)) from None
     tracks.names = _names(path, found, old_views, tracks.names)
+    if "sizes" in found:
+        tracks.sizes, tracks.colours = found["sizes"][old_views], found["colours"][old_points]
     if start is not None:
         if len(start.P) <= old_views[-1] or len(start.Q) <= old_points[-1]:
             reason = f"has {len(start.P)} cameras and {len(start.Q)} points but tracks of more"
@@ -310,7 +325,7 @@ def _form(path: PathLike) -> str:
     raise ArgumentError("path", f"is {str(path)!r}", f"a name ending in {listed(_SUFFIXES)}")
 
 
-def _read(path: Path, with_start: bool) -> dict[str, Any]:
+def _read(path: Path, with_start: bool, image_size: ArrayLike | None = None) -> dict[str, Any]:
     """Read whatever a file holds."""
     try:
         form = _form(path)
@@ -320,6 +335,12 @@ def _read(path: Path, with_start: bool) -> dict[str, Any]:
         was = f"is {str(path)!r}, which does not exist"
         raise ArgumentError("path", was, f"{error.needed}; or a COLMAP folder") from None
     with path.open("rb") as file:
+        head = file.read(len(OPENSFM))
+        file.seek(0)
+        if form == ".csv" and head == OPENSFM:
+            return read_opensfm(path, file, image_size)
+        if image_size is not None:
+            raise ArgumentError("image_size", f"is given for {path.name!r:.60}", "OpenSfM's tracks")
         if form == ".npz":
             start = ("P", "Q", "X") if with_start else ()
             optional = ("weights", "clean", "n_views", "n_points", *start)
