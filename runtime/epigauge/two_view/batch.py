@@ -160,8 +160,9 @@ def refine_fundamental_batch(
         On bad shapes, NaN or infinity, offsets that do not partition the matches, and unknown
         options.
     """
-    if arrays.is_tensor(x1) or options.get("backend") == "array":
-        found = _over_arrays(x1, x2, offsets, F0, weights, {**options})
+    known = known_options("refine_fundamental_batch", options, PairOptions)
+    if arrays.is_tensor(x1) or known.get("backend") == "array":
+        found = _over_arrays(x1, x2, offsets, F0, weights, known)
         if flags:
             _ = found.flags  # computed when asked for
         return found
@@ -173,7 +174,6 @@ def refine_fundamental_batch(
     starts = None if F0 is None else np.ascontiguousarray(as_real("F0", F0, needed))
     if starts is not None and starts.shape != (count, 3, 3):
         raise ArgumentError("F0", f"has shape {starts.shape}", f"({count}, 3, 3)")
-    known = known_options("refine_fundamental_batch", options, PairOptions)
     _check_options(known)
     if executor is not None:
         return _elsewhere(executor, (x1, x2, bounds, starts, w), known, progress)
