@@ -7,11 +7,13 @@ from dataclasses import replace
 import epigauge as eg
 import numpy as np
 import pytest
-from epigauge.two_view import minima
-from epigauge.two_view.diagnostics import _variance_ratio_99, diagnose, planar_bound
+from epigauge.two_view import diagnostics, minima
+from epigauge.two_view.consensus import RANGE
+from epigauge.two_view.diagnostics import AFFINE, _variance_ratio_99, diagnose, planar_bound
 from epigauge.two_view.evidence import evidence
 from epigauge.two_view.homography import fit_homography
-from epigauge.two_view.suspicion import is_suspicious
+from epigauge.two_view.planes import HIDDEN
+from epigauge.two_view.suspicion import WIDE, is_suspicious
 from epigauge.verdicts import FLAGS
 from two_views import algebraic, homogeneous, inliers, scene
 
@@ -158,6 +160,30 @@ def test_the_bound_of_a_plane_is_fishers_quantile_by_its_degrees_of_freedom() ->
             least = planar_bound(10**7, 7) / (2e7 - 8)
             expected = (2 * n - 8) * max(exact, least)
             assert planar_bound(n, parameters) == pytest.approx(expected, rel=0.1)
+
+
+def test_bounds_are_the_quantiles_that_they_are_said_to_be() -> None:
+    stats = pytest.importorskip("scipy.stats")
+    assert pytest.approx(stats.chi2.ppf(0.99, 3), abs=0.01) == AFFINE  # what an affine F lacks
+    assert pytest.approx(stats.chi2.ppf(0.99, 8), abs=0.01) == diagnostics._CHI2_8
+    assert pytest.approx(stats.norm.ppf(0.99), abs=1e-3) == diagnostics._NORMAL_99
+
+
+def test_of_many_matches_the_bound_of_a_plane_is_the_geometric_aic() -> None:
+    # S_H + 2 (2 n + 8) s^2 <= S + 2 (3 n + p) s^2, with S = (n - p) s^2
+    for n, p in ((10**5, 7), (10**6, 5)):
+        aic = (n - p) + 2 * (3 * n + p) - 2 * (2 * n + 8)
+        assert planar_bound(n, p) == pytest.approx(aic, rel=1e-3)
+
+
+def test_wide_residuals_of_a_plane_are_suspicious(evidences) -> None:
+    """An F that a plane leaves free bends to wrong matches with little error."""
+    for kind, expected in (("general", False), ("planar", True)):
+        x1, x2 = scene(kind, 200, 2.5, np.random.default_rng(2))
+        eg.refine_fundamental(x1, x2, backend="numpy")
+        found = evidences[-1][0]
+        assert WIDE < found.noise / RANGE < HIDDEN
+        assert is_suspicious(found) == expected
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])

@@ -36,6 +36,20 @@ def assert_same_course(a, b, tolerance=1e-9):
         assert row.step_norm == pytest.approx(other.step_norm, rel=1e-3, abs=1e-9)
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_flat_minimum_is_known_by_the_decrease_that_is_left(monkeypatch, seed) -> None:
+    """With a Hessian too ill-conditioned for a factor, in eigenvectors."""
+    rng = np.random.default_rng(seed)
+    X = np.column_stack([rng.uniform(-1.5, 1.5, 60), rng.uniform(-1.0, 1.0, 60), np.ones(60)])
+    X[:, 2] = 4.0 + 0.4 * X[:, 0] + 1e-4 * rng.standard_normal(60)  # next to no relief
+    x1, x2 = (1000.0 * Y[:, :2] / Y[:, 2:] for Y in (X, X + np.array([0.6, 0.1, 0.1])))
+    x1, x2 = (x + 1e-4 * rng.standard_normal(x.shape) for x in (x1, x2))
+    compiled, reference = both(monkeypatch, x1, x2)
+    assert compiled.condition > 1e4  # of the Jacobian; of the Hessian its square
+    assert (compiled.status, compiled.nfev) == (reference.status, reference.nfev)
+    assert compiled.status == 4
+
+
 @pytest.mark.parametrize("parameterization", ["ortho", "block"])
 @pytest.mark.parametrize("criterion", ["reprojection", "sampson", "epipolar"])
 @pytest.mark.parametrize("damping", ["levenberg", "seber"])
