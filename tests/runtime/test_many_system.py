@@ -158,14 +158,20 @@ def test_constraints_are_solved_by_woodbury(small: tuple, ties: bool) -> None:
     assert_solves(constrained, constrained.damped_step(blocks, 0.1), blocks, 0.1)
 
 
+@pytest.mark.parametrize("n_constraints", [0, 5])  # each has a right-hand side of its own
 @pytest.mark.parametrize("ties", [False, True])
 def test_conjugate_gradients_give_the_same_step(
-    small: tuple, ties: bool, monkeypatch: pytest.MonkeyPatch
+    small: tuple, ties: bool, n_constraints: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem, state, _ = small
     problem.kernels = kernels.table("numpy")
     system = problem.linearize(state)
     system = tied(system, 6) if ties else system
+    if n_constraints:
+        rng = np.random.default_rng(3)
+        shapes = system.normal.g_cameras.shape, system.normal.g_points.shape
+        border = (rng.standard_normal((*shape, n_constraints)) for shape in shapes)
+        system = replace(system, constraints=Border(*border))
     blocks = blocks_for(system)
     expected = np.asarray(system.damped_step(blocks, 0.1))
     monkeypatch.setattr(numpy_linearizer, "DENSE_CAMERAS", 0)
