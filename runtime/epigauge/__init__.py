@@ -59,12 +59,14 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge.two_view.refine import refine_fundamental
     from epigauge.two_view.result import FundamentalResult
     from epigauge.two_view.robust import RobustResult, estimate_fundamental
+    from epigauge.uncertainty.affine import AffineCovariance
     from epigauge.uncertainty.covariance import MetricCovariance
 
 __version__ = "0.1.0"
 
 __all__ = [
     "BATCH_STATUS",
+    "AffineCovariance",
     "AffineReconstruction",
     "ArgumentError",
     "BackendError",
@@ -166,6 +168,7 @@ _WHERE = {
     "two_view.refine": "refine_fundamental",
     "two_view.result": "FundamentalResult",
     "two_view.robust": "RobustResult estimate_fundamental",
+    "uncertainty.affine": "AffineCovariance",
     "uncertainty.covariance": "MetricCovariance",
 }
 _MODULES = {

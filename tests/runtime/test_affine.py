@@ -158,6 +158,104 @@ def test_the_projective_scene_shows_the_same() -> None:
     assert np.abs(same.project(tracks) - truth.project(tracks)).max() < 1e-10
 
 
-def test_covariances_of_affine_cameras_are_refused() -> None:
-    with pytest.raises(eg.ArgumentError, match="reconstruction is a AffineReconstruction"):
-        eg.covariance(*scene())  # type: ignore[call-overload]
+def dense_covariance(tracks, found, conditions):
+    """Return the covariance of all cameras' and points' numbers from the bordered normal matrix."""
+    n, m = found.n_views, found.n_points
+    J = np.zeros((2 * len(tracks), 8 * n + 3 * m))
+    for row, (i, j) in enumerate(zip(tracks.view, tracks.point, strict=True)):
+        J[2 * row, 8 * i : 8 * i + 4] = J[2 * row + 1, 8 * i + 4 : 8 * i + 8] = [*found.X[j], 1.0]
+        J[2 * row : 2 * row + 2, 8 * n + 3 * j : 8 * n + 3 * j + 3] = found.P[i, :2, :3]
+    weighted = np.repeat(tracks.weights, 2)[:, None] * J
+    C = conditions(n, m)
+    none = np.zeros((C.shape[1], C.shape[1]))
+    whole = np.block([[J.T @ weighted, C], [C.T, none]])
+    scale = 1.0 / np.sqrt(np.maximum(np.abs(whole).max(axis=0), 1e-12))
+    return (scale[:, None] * np.linalg.inv(scale[:, None] * whole * scale) * scale)[: J.shape[1]][
+        :, : J.shape[1]
+    ]
+
+
+@pytest.mark.parametrize("datum", ["inner", "some", "four"])
+def test_covariances_are_those_of_the_bordered_normal_matrix(datum) -> None:
+    rng = np.random.default_rng(4)
+    view, point = (a.ravel() for a in np.meshgrid(np.arange(4), np.arange(9), indexing="ij"))
+    P, X = rng.normal(0.0, 40.0, (4, 2, 4)), rng.normal([5.0, 0.0, 2.0], [1.0, 2.0, 3.0], (9, 3))
+    xy = np.einsum("kij,kj->ki", P[view], np.column_stack([X, np.ones(9)])[point])
+    xy += rng.normal(0.0, 0.3, xy.shape)
+    tracks = eg.Tracks(view, point, xy, weights=rng.uniform(0.5, 2.0, 36))
+    found = eg.bundle_adjust(tracks, eg.AffineReconstruction(P, X), ftol=1e-14).reconstruction
+    own = [2, 3, 5, 6, 8]
+    gauges = {
+        "inner": "inner",
+        "some": eg.gauge.inner(points=own),
+        "four": eg.gauge.five_points([1, 4, 6, 7]),
+    }
+
+    def conditions(n, m):
+        C = np.zeros((8 * n + 3 * m, 12))
+        those = {"inner": range(m), "some": own, "four": [1, 4, 6, 7]}[datum]
+        for k, j in enumerate(those):
+            # All affine motions of a point, or each of its coordinates.
+            rows = slice(8 * n + 3 * j, 8 * n + 3 * j + 3)
+            if datum == "four":
+                C[rows, 3 * k : 3 * k + 3] = np.eye(3)
+            else:
+                C[rows] = np.kron(np.eye(3), [*found.X[j], 1.0])
+        return C
+
+    cov = eg.covariance(tracks, found, gauges[datum], noise_px=0.3)
+    wanted = 0.3**2 * dense_covariance(tracks, found, conditions)
+    size = np.abs(wanted).max()
+    for i in range(4):
+        np.testing.assert_allclose(
+            cov.camera(i), wanted[8 * i : 8 * i + 8, 8 * i : 8 * i + 8], atol=1e-8 * size
+        )
+    at = [slice(32 + 3 * j, 35 + 3 * j) for j in range(9)]
+    largest = np.abs(wanted[32:, 32:]).max()
+    for j in range(9):
+        np.testing.assert_allclose(cov.point(j), wanted[at[j], at[j]], atol=1e-8 * largest)
+    across = cov.between(("camera", 1), ("point", 2))
+    np.testing.assert_allclose(across, wanted[8:16, at[2]], atol=1e-8 * np.sqrt(size * largest))
+    np.testing.assert_allclose(cov.std.points[3] ** 2, np.diag(cov.point(3)), atol=1e-12 * largest)
+    np.testing.assert_allclose(
+        cov.std.cameras[2].ravel() ** 2, np.diag(cov.camera(2)), atol=1e-10 * size
+    )
+    moved = eg.covariance(tracks, found, noise_px=0.3).in_gauge(gauges[datum])
+    np.testing.assert_allclose(moved.point(0), cov.point(0), atol=1e-10 * largest)
+    assert cov.open == 12
+    assert cov.redundancy == 72 - 8 * 4 - 3 * 9 + 12
+
+
+def test_covariance_says_what_it_does_not_know() -> None:
+    tracks, found = scene(n=5)
+    held = eg.covariance(tracks, found, noise_px=1.0, fixed_points=[0, 1, 2, 3])
+    assert held.open == 0
+    assert not held.point(2).any()
+    for gauge in (eg.gauge.two_cameras(), eg.gauge.inner(views=[0])):
+        with pytest.raises(eg.ArgumentError, match="gauge"):
+            eg.covariance(tracks, found, gauge)
+    with pytest.raises(eg.ArgumentError, match="loss"):
+        eg.covariance(tracks, found, loss="huber")  # type: ignore[call-overload]
+    with pytest.raises(eg.ArgumentError, match="refine"):
+        eg.covariance(tracks, found, refine="pose")  # type: ignore[call-overload]
+    with pytest.raises(eg.ArgumentError, match="below 5"):
+        eg.covariance(tracks, found).camera(5)
+
+
+@pytest.mark.parametrize("kind", ["affine", "projective"])
+def test_scenes_go_through_files(tmp_path, kind) -> None:
+    tracks, _ = scene(n=5)
+    tracks = eg.Tracks(tracks.view, tracks.point, tracks.xy, names=[f"{k}.jpg" for k in range(5)])
+    start = eg.initialize_affine(tracks)
+    made = start if kind == "affine" else start.to_projective()
+    eg.save_scene(tmp_path / "s.npz", tracks, made)
+    again, found = eg.load_scene(tmp_path / "s.npz")
+    assert type(found) is type(made)
+    assert again.names == tracks.names
+    for name in ("P", "X" if kind == "affine" else "Q"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(made, name))
+    for name in ("folder", "p.txt"):
+        with pytest.raises(eg.ArgumentError, match=r"\.npz"):
+            eg.save_scene(tmp_path / name, tracks, made)
+    with pytest.raises(eg.ArgumentError, match="tracks are of 5 views"):
+        type(made)(made.P[:4], made.X if kind == "affine" else made.Q).project(tracks)

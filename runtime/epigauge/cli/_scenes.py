@@ -100,6 +100,9 @@ class SceneJob:
     ) -> None:
         self.path, self.rigs, self.image_size = path, rigs, image_size
         self.tracks, self.start = load_scene(path)
+        if not isinstance(self.start, eg.MetricReconstruction):
+            was = "is given with cameras that are not calibrated"
+            raise ArgumentError("--refine", was, "a scene with calibrated ones, or none")
         model = self.start.cameras.model
         if image_size is not None and model != "bal":
             was = f"is given with cameras of the model {model}"

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.cameras import MetricReconstruction
+from epigauge.cameras import AffineReconstruction, AnyReconstruction, MetricReconstruction
 from epigauge.errors import FileFormatError
 from epigauge.io._colmap_parts import Place
 from epigauge.io._colmap_text import camera_line, camera_of, frame_line, frame_of, rig_line, rig_of
@@ -19,11 +19,15 @@ from epigauge.io._npz import read_npz, write_npz
 from epigauge.io._scene import ColmapSource, RawScene, SceneSource
 from epigauge.io.output import writing
 from epigauge.io.tracks import arrays_of, check_observations
+from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.tracks import Tracks
 
 Row = TypeVar("Row")
 
-_NEEDED = ("view", "point", "xy", "R", "t", "X", "model", "params", "camera_of_view")
+_TRACKS = ("view", "point", "xy")
+_NEEDED = (*_TRACKS, "R", "t", "X", "model", "params", "camera_of_view")
+#: The same of cameras without rotations: affine and projective ones.
+_AFFINE, _PROJECTIVE = (*_TRACKS, "P", "X"), (*_TRACKS, "P", "Q")
 _LABELS = ("weights", "names", "sizes", "colours", "notes", "rotations")
 _IDS = ("image_ids", "camera_ids", "point_ids", "feature_of")
 _COLMAP = (*(f"colmap_{name}" for name in _IDS), "colmap_features", "colmap_feature_counts")
@@ -42,7 +46,7 @@ def is_npz_scene(path: Path) -> bool:
 def write_npz_scene(
     path: Path,
     tracks: Tracks,
-    reconstruction: MetricReconstruction,
+    reconstruction: AnyReconstruction,
     more: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a scene.
@@ -53,20 +57,20 @@ def write_npz_scene(
         The file.
     tracks : Tracks
         Observations.
-    reconstruction : MetricReconstruction
+    reconstruction : MetricReconstruction, AffineReconstruction or Reconstruction
         Of the same views and points.
     more : mapping of str to array_like, optional
         Further arrays, under other names.
     """
-    cameras = reconstruction.cameras
-    arrays: dict[str, Any] = arrays_of(tracks) | {
-        "R": reconstruction.R,
-        "t": reconstruction.t,
-        "X": reconstruction.X,
-        "model": _bytes([cameras.model]),
-        "params": cameras.params,
-        "camera_of_view": cameras.camera_of_view,
-    }
+    arrays = arrays_of(tracks)
+    match reconstruction:
+        case MetricReconstruction(R=R, t=t, X=X, cameras=cameras):
+            arrays |= {"R": R, "t": t, "X": X, "model": _bytes([cameras.model])}
+            arrays |= {"params": cameras.params, "camera_of_view": cameras.camera_of_view}
+        case AffineReconstruction(P=P, X=X):
+            arrays |= {"P": P, "X": X}
+        case Reconstruction(P=P, Q=Q):
+            arrays |= {"P": P, "Q": Q}
     if tracks.names is not None:
         arrays["names"] = _bytes(tracks.names)
     for name in ("sizes", "colours"):
@@ -118,14 +122,17 @@ def read_npz_scene(path: Path) -> RawScene:
         If the file cannot be read.
     """
     with path.open("rb") as file:
-        found = read_npz(path, file, [_NEEDED], (*_LABELS, *_COLMAP, *_TEXTS))
+        forms = [_NEEDED, _AFFINE, _PROJECTIVE]
+        found = read_npz(path, file, forms, (*_LABELS, *_COLMAP, *_TEXTS))
+    if "R" not in found:
+        found |= _without_rotations(path, found)
     view, point, xy = check_observations(path, found)
     n, m = (len(np.atleast_1d(found[name])) for name in ("R", "X"))
     N, c = len(view), len(np.atleast_1d(found["params"]))
     for name, kinds, shape in (
-        ("R", "f", (n, 3, 3)),
+        ("R", "f", (n, 3, None)),
         ("t", "f", (n, 3)),
-        ("X", "f", (m, 3)),
+        ("X", "f", (m, None)),
         ("params", "f", (c, None)),
         ("camera_of_view", "iu", (n,)),
         ("weights", "f", (N,)),
@@ -176,6 +183,23 @@ def read_npz_scene(path: Path) -> RawScene:
         found.get("colours"),
         source,
     )
+
+
+def _without_rotations(path: Path, found: dict[str, Any]) -> dict[str, Any]:
+    """Return what stands for the arrays of a scene of affine or projective cameras."""
+    P, points = found["P"], found["X" if "X" in found else "Q"]
+    for name, array, sides in (("P", P, (3, 4)), ("points", points, (3 if "X" in found else 4,))):
+        if array.dtype.kind != "f" or array.shape[1:] != sides or not len(array):
+            raise FileFormatError(path, f"array {name} has type {array.dtype}, shape {array.shape}")
+    n = len(P)
+    return {
+        "R": P,
+        "t": np.zeros((n, 3)),
+        "X": points,
+        "model": _bytes(["affine" if "X" in found else "projective"]),
+        "params": np.zeros((1, 0)),
+        "camera_of_view": np.zeros(n, np.int64),
+    }
 
 
 def _check(

@@ -10,8 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.cameras import Cameras, MetricReconstruction
+from epigauge.cameras import (
+    AffineReconstruction,
+    AnyReconstruction,
+    Cameras,
+    MetricReconstruction,
+)
 from epigauge.errors import ArgumentError, FileFormatError
+from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.tracks import Tracks
 
 if TYPE_CHECKING:
@@ -74,7 +80,10 @@ class ColmapSource:
 
 @dataclass(frozen=True)
 class RawScene:
-    """Arrays of a file: an observation, view, camera or point a row; nothing left out yet."""
+    """Arrays of a file: an observation, view, camera or point a row; nothing left out yet.
+
+    Cameras without rotations have P (n, 3, 4) for R, and no t and params.
+    """
 
     view: Indices
     point: Indices
@@ -94,7 +103,7 @@ class RawScene:
 
 def finished(
     path: Path, raw: RawScene, repeated: str, weak: str
-) -> tuple[Tracks, MetricReconstruction]:
+) -> tuple[Tracks, AnyReconstruction]:
     """Leave out what cannot be used, and check the rest.
 
     Parameters
@@ -152,12 +161,14 @@ def finished(
             repeated=True,
             min_points=MIN_POINTS,
         )
-        reconstruction = MetricReconstruction(
-            raw.R[views],
-            raw.t[views],
-            raw.X[points],
-            Cameras(raw.model, raw.params[cameras], new_camera),
-        )
+        reconstruction: AnyReconstruction
+        if raw.model == "affine":
+            reconstruction = AffineReconstruction(raw.R[views], raw.X[points])
+        elif raw.model == "projective":
+            reconstruction = Reconstruction(raw.R[views], raw.X[points])
+        else:
+            made = Cameras(raw.model, raw.params[cameras], new_camera)
+            reconstruction = MetricReconstruction(raw.R[views], raw.t[views], raw.X[points], made)
     except ArgumentError as error:
         raise FileFormatError(path, str(error)) from None
     source = replace(raw.source, notes=tuple(dict.fromkeys(notes)))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._arguments import as_choice
-from epigauge.cameras import MetricReconstruction
+from epigauge.cameras import AnyReconstruction, MetricReconstruction
 from epigauge.cameras.bal import colmap_to_bal
 from epigauge.errors import ArgumentError
 from epigauge.io._bal import read_bal, write_bal
@@ -35,17 +36,15 @@ _REPEATED = ("keep", "first", "refuse")
 _WEAK = ("drop", "refuse")
 
 
-def load_scene(
-    path: PathLike, *, repeated: str = "keep", weak: str = "drop"
-) -> tuple[Tracks, MetricReconstruction]:
-    """Read a scene: observations, calibrated cameras, points.
+def load_scene(path: PathLike, *, repeated: str = "keep", weak: str = "drop") -> tuple[Tracks, Any]:
+    """Read a scene: observations, cameras, points.
 
     A directory is a COLMAP model, binary (``cameras.bin``, ``images.bin``, ``points3D.bin``) or
     text; with ``rigs`` and ``frames`` of COLMAP 3.12 and later, these have the poses. Pixels stay
     COLMAP's, with (0.5, 0.5) in the middle of the first one. A file ``.txt``, ``.txt.bz2`` or
     ``.txt.gz`` is a problem of "Bundle Adjustment in the Large", its cameras of the model ``bal``.
     ``.out`` is Bundler's, with the names of the images in ``list.txt`` beside it, its cameras of
-    the model ``bal``. ``.npz`` is what `save_scene` writes.
+    the model ``bal``. ``.npz`` is what `save_scene` writes: calibrated, affine or projective cameras.
 
     Parameters
     ----------
@@ -64,8 +63,8 @@ def load_scene(
         Observations, with names and sizes of images and colours of points where the file has them.
         ``tracks.source.notes`` says what was left out or changed; its other content lets
         `save_scene` write what else the file held.
-    reconstruction : MetricReconstruction
-        Cameras and points of the tracks.
+    reconstruction : MetricReconstruction, AffineReconstruction or Reconstruction
+        Cameras and points of the tracks; of a folder and of BAL a `MetricReconstruction`.
 
     Raises
     ------
@@ -110,7 +109,7 @@ def load_scene(
 def save_scene(
     path: PathLike,
     tracks: Tracks,
-    reconstruction: MetricReconstruction,
+    reconstruction: AnyReconstruction,
     *,
     text: bool = False,
     rigs: str = "keep",
@@ -128,8 +127,8 @@ def save_scene(
     tracks : Tracks
         Observations. Those of `load_scene` keep COLMAP's numbers of images, cameras and points, its
         features without points, rigs and frames.
-    reconstruction : MetricReconstruction
-        Of the same views and points.
+    reconstruction : MetricReconstruction, AffineReconstruction or Reconstruction
+        Of the same views and points; only NPZ holds the last two.
     text : bool
         Write a COLMAP folder as text, not binary.
     rigs : {"keep", "drop"}
@@ -154,18 +153,20 @@ def save_scene(
     content = scene_content(path, tracks, reconstruction, rigs)
     export = None if path.is_dir() else _EXPORTS.get(path.suffix.lower())
     if export is not None:
+        assert isinstance(reconstruction, MetricReconstruction)
         export(path, tracks, reconstruction)
     elif content is None:
         write_npz_scene(path, tracks, reconstruction)
     elif isinstance(content, ColmapModel):
         write_folder(path, content, text)
     else:
+        assert isinstance(reconstruction, MetricReconstruction)
         with writing(path) as file, compressing(file, path.suffix.lower()) as stream:
             write_bal(stream, tracks, content, reconstruction.X)
 
 
 def scene_content(
-    path: Path, tracks: Tracks, reconstruction: MetricReconstruction, rigs: str = "keep"
+    path: Path, tracks: Tracks, reconstruction: AnyReconstruction, rigs: str = "keep"
 ) -> ColmapModel | Array | None:
     """Return what is written to a path: a COLMAP model, BAL's cameras, or None for NPZ.
 
@@ -179,9 +180,14 @@ def scene_content(
         was = f"has {reconstruction.n_views} views and {reconstruction.n_points} points"
         needed = f"{tracks.n_views} and {tracks.n_points}, as the tracks"
         raise ArgumentError("reconstruction", was, needed)
+    if is_scene_file(path) and path.suffix.lower() == ".npz":
+        return None
+    if not isinstance(reconstruction, MetricReconstruction):
+        was = f"is a {type(reconstruction).__name__}, which has no calibrated cameras"
+        raise ArgumentError("reconstruction", was, "a name ending in .npz")
     if not is_scene_file(path):
         return model_of(tracks, reconstruction, rigs)
-    if path.suffix.lower() in (".npz", *_EXPORTS):
+    if path.suffix.lower() in _EXPORTS:
         return None
     return _nine_numbers(tracks, reconstruction)
 

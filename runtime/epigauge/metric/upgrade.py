@@ -226,6 +226,7 @@ def _in_front(tracks: Tracks, start: MetricReconstruction, options: Any) -> Bund
     weights = np.asarray(tracks.weights)
     for _ in range(_ROUNDS):
         bundle = bundle_adjust(tracks.weighted(weights), start, robust=True, ftol=1e-6, **options)
+        assert isinstance(bundle.reconstruction, MetricReconstruction)
         start = bundle.reconstruction
         counts = ~bundle.rejected & (weights > 0.0)
         behind = np.zeros(tracks.n_points, dtype=np.bool_)

@@ -23,7 +23,12 @@ from epigauge._results import Result
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.priors import Prior
-from epigauge.cameras import MetricReconstruction, camera_model
+from epigauge.cameras import (
+    AffineReconstruction,
+    AnyReconstruction,
+    MetricReconstruction,
+    camera_model,
+)
 from epigauge.errors import ArgumentError
 from epigauge.lengths import linear_length
 from epigauge.multi_view.datum import Projector, halves, mapped, projector
@@ -35,6 +40,7 @@ from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.sandwich import Sandwich
 from epigauge.multi_view.tracks import Tracks
 from epigauge.two_view.losses import LOSSES, Loss
+from epigauge.uncertainty.affine import AffineCovariance, affine_covariance
 from epigauge.uncertainty.covariance import MetricCovariance
 from epigauge.uncertainty.influence import Influence, RobustFit
 from epigauge.uncertainty.metric import metric_covariance, robust_loss
@@ -276,9 +282,22 @@ def covariance(
 ) -> MetricCovariance: ...
 
 
+@overload
 def covariance(
     tracks: Tracks,
-    reconstruction: Reconstruction | MetricReconstruction,
+    reconstruction: AffineReconstruction,
+    gauge: Any = None,
+    noise_px: float | None = None,
+    *,
+    fixed_views: Iterable[int] = (),
+    fixed_points: Iterable[int] = (),
+    backend: str | None = None,
+) -> AffineCovariance: ...
+
+
+def covariance(
+    tracks: Tracks,
+    reconstruction: AnyReconstruction,
     gauge: Any = None,
     noise_px: float | None = None,
     *,
@@ -286,7 +305,7 @@ def covariance(
     loss_scale_px: float | str = "auto",
     backend: str | None = None,
     **of_metric: Any,
-) -> ReconstructionCovariance | MetricCovariance:
+) -> ReconstructionCovariance | MetricCovariance | AffineCovariance:
     """Return the covariance of an adjusted reconstruction, in any gauge.
 
     Parameters
@@ -294,13 +313,14 @@ def covariance(
     tracks : Tracks
         Observations that the reconstruction was adjusted to, with their weights: zero for those
         that were set aside.
-    reconstruction : Reconstruction or MetricReconstruction
+    reconstruction : Reconstruction, MetricReconstruction or AffineReconstruction
         Cameras and points at the minimum.
     gauge : Gauge or "inner", optional
         Of a metric reconstruction, which is not moved, the datum: "inner" (default) for inner
         constraints over all points, ``eg.gauge.inner(points=..., views=...)`` over some,
         `two_cameras` (one and the distance of another), `reference_camera`, or `five_points` (of
         three points seven coordinates). What priors and fixed parts hold needs no datum.
+        Of an affine one "inner", over all or some points, or `five_points`, of which four stay.
         A projective reconstruction is moved there, and its covariance is that of the estimate
         expressed in that gauge. By default the free gauge of the reconstruction as it is: the
         pseudo-inverse of the normal matrix, of least trace. What a gauge leaves open (an
@@ -320,11 +340,11 @@ def covariance(
         Where the formulas are computed.
     **of_metric
         Of a metric reconstruction `refine`, `fixed_views`, `fixed_points` and `priors`, as they
-        were given to `bundle_adjust`.
+        were given to `bundle_adjust`; of an affine one `fixed_views` and `fixed_points`.
 
     Returns
     -------
-    ReconstructionCovariance or MetricCovariance
+    ReconstructionCovariance, MetricCovariance or AffineCovariance
         Covariances of cameras, points and projected points, and the way to other gauges.
 
     Raises
@@ -343,9 +363,23 @@ def covariance(
     .. [1] K. Kanatani, D. D. Morris, "Gauges and gauge transformations for uncertainty description
        of geometric structure with indeterminacy", IEEE Trans. Inf. Theory 47(5), 2001.
     """
+    if isinstance(reconstruction, AffineReconstruction):
+        if as_choice("loss", loss, LOSSES) != "linear":
+            raise ArgumentError("loss", f"is {loss!r} with affine cameras", "'linear'")
+        for name in of_metric.keys() - {"fixed_views", "fixed_points"}:
+            raise ArgumentError(name, "is given with affine cameras", "a metric reconstruction")
+        return affine_covariance(
+            tracks,
+            reconstruction,
+            "inner" if gauge is None else gauge,
+            noise_px,
+            backend=backend,
+            **of_metric,
+        )
     if not isinstance(reconstruction, Reconstruction | MetricReconstruction):
         was = f"is a {type(reconstruction).__name__}"
-        raise ArgumentError("reconstruction", was, "an eg.Reconstruction or MetricReconstruction")
+        needed = "an eg.Reconstruction, MetricReconstruction or AffineReconstruction"
+        raise ArgumentError("reconstruction", was, needed)
     if isinstance(reconstruction, MetricReconstruction):
         datum = "inner" if gauge is None else gauge
         options: Any = {**of_metric, "backend": backend}

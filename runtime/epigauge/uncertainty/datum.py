@@ -80,6 +80,28 @@ def projection(
         C = _first(C, G, free)
     elif C[0].shape[2] > free:
         C = C[0] @ motions.open, C[1] @ motions.open
+    return onto(C, inverse, datum)
+
+
+def onto(C: tuple[Array, Array], inverse: Inverse | Sandwich, datum: Any) -> Projection:
+    """Return what takes the covariance of an `Inverse` to where conditions hold.
+
+    Parameters
+    ----------
+    C : tuple of ndarray, shape (n, d, f), (m, 3, f)
+        As many conditions as there are free motions, as columns.
+    inverse : Inverse or Sandwich
+        X.
+    datum : object
+        What the conditions stand for, to be named in messages.
+
+    Raises
+    ------
+    ArgumentError
+        If they leave a motion free.
+    """
+    motions = inverse.motions
+    G, free = motions.along(motions.open), motions.open.shape[1]
     product = products(C, G)
     values = np.linalg.svd(product, compute_uv=False)
     if len(product) < free or not values[-1] > 1e-9 * values[0]:
@@ -87,7 +109,7 @@ def projection(
             "gauge", f"is {datum!r:.80}, which leaves motions free", "points or views apart"
         )
     # K = (C G)^-1 C: S = I - G K.
-    back = np.linalg.inv(product).T
+    back = np.asarray(np.linalg.inv(product).T)
     K = combined(C[0], back), combined(C[1], back)
     T = inverse.apply(*K)
     R = products(K, T)

@@ -29,7 +29,7 @@ from epigauge.uncertainty.influence import RobustFit
 from epigauge.uncertainty.inverse import Inverse, Motions
 from epigauge.uncertainty.sandwich import Difference, Sandwich, pull
 
-__all__ = ["metric_covariance", "robust_loss"]
+__all__ = ["metric_covariance", "redundancy_of", "robust_loss"]
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ def metric_covariance(
         return state.cost, system, NumpyLinearizer(*parts, job.whitening)
 
     cost, system, reference = normal(weights)
-    redundancy = _redundancy(tracks, job, Motions.of(system, priors_there, table))
+    redundancy = redundancy_of(tracks, job, Motions.of(system, priors_there, table))
     fit = None
     if loss != "linear":
         r = reference.observe(cameras, points)[0].T
@@ -114,7 +114,7 @@ def metric_covariance(
     )
 
 
-def _redundancy(tracks: Tracks, job: Job, motions: Motions) -> int:
+def redundancy_of(tracks: Tracks, job: Job, motions: Motions) -> int:
     """Return how many observations and priors there are beyond what the unknowns need."""
     ties = job.freedom.ties
     n, m = tracks.n_views, tracks.n_points
