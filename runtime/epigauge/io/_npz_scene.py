@@ -124,15 +124,16 @@ def read_npz_scene(path: Path) -> RawScene:
     with path.open("rb") as file:
         forms = [_NEEDED, _AFFINE, _PROJECTIVE]
         found = read_npz(path, file, forms, (*_LABELS, *_COLMAP, *_TEXTS))
-    if "R" not in found:
+    calibrated = "R" in found
+    if not calibrated:
         found |= _without_rotations(path, found)
     view, point, xy = check_observations(path, found)
     n, m = (len(np.atleast_1d(found[name])) for name in ("R", "X"))
     N, c = len(view), len(np.atleast_1d(found["params"]))
     for name, kinds, shape in (
-        ("R", "f", (n, 3, None)),
+        ("R", "f", (n, 3, 3 if calibrated else 4)),
         ("t", "f", (n, 3)),
-        ("X", "f", (m, None)),
+        ("X", "f", (m, 3) if calibrated else (m, None)),
         ("params", "f", (c, None)),
         ("camera_of_view", "iu", (n,)),
         ("weights", "f", (N,)),

@@ -29,8 +29,8 @@ class Seen:
         Pixels, and positive factors.
     P, Q : ndarray, shape (n, 3, 4), (m, 4)
         Their cameras and points.
-    views : ndarray of int, shape (n,)
-        Old numbers of the views.
+    views, points : ndarray of int, shape (n,), (m,)
+        Old numbers of the views and points.
     """
 
     view: Indices
@@ -40,6 +40,7 @@ class Seen:
     P: Array
     Q: Array
     views: Indices
+    points: Indices
 
     @property
     def n(self) -> int:
@@ -57,7 +58,7 @@ class Seen:
         counts = tracks.weights > 0.0
         n, m = tracks.n_views, tracks.n_points
         arrays = tracks.xy[counts], tracks.weights[counts], np.zeros((n, 3, 4)), np.zeros((m, 4))
-        return Seen(tracks.view[counts], tracks.point[counts], *arrays, np.arange(n))
+        return Seen(tracks.view[counts], tracks.point[counts], *arrays, np.arange(n), np.arange(m))
 
     @staticmethod
     def of(tracks: Tracks, found: Reconstruction, rejected: Mask) -> tuple[Seen, int]:
@@ -67,10 +68,11 @@ class Seen:
         lengths = np.bincount(tracks.point[counts], minlength=tracks.n_points)
         counts &= lengths[tracks.point] >= MIN_VIEWS
         if counts.all():
-            every, observed = np.arange(tracks.n_views), (tracks.xy, tracks.weights)
-            return Seen(tracks.view, tracks.point, *observed, found.P, found.Q, every), 0
+            every = np.arange(tracks.n_views), np.arange(tracks.n_points)
+            observed = tracks.xy, tracks.weights
+            return Seen(tracks.view, tracks.point, *observed, found.P, found.Q, *every), 0
         views, view = np.unique(tracks.view[counts], return_inverse=True)
         points, point = np.unique(tracks.point[counts], return_inverse=True)
         before = len(np.unique(tracks.view[tracks.weights > 0.0]))
         arrays = tracks.xy[counts], tracks.weights[counts], found.P[views], found.Q[points]
-        return Seen(view, point, *arrays, views), before - len(views)
+        return Seen(view, point, *arrays, views, points), before - len(views)

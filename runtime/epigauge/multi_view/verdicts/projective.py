@@ -93,9 +93,15 @@ def judged(
     frame = Frame.of(tracks)
     if len(seen.view) < len(tracks) or not (isinstance(system, BundleSystem) and suits(system)):
         system = None
-    of_cameras, of_points, weakest, parts = open_directions(seen, frame, kernels, workers, system)
-    of_cameras = max(missing_by_count(seen), of_cameras) + CAMERA * lost
-    views, points = (len(part) for part in fixed or ((), ()))
+    held = None
+    if fixed is not None:
+        held = np.isin(seen.views, fixed[0]), np.isin(seen.points, fixed[1])
+    how = frame, kernels, workers, system, held
+    of_cameras, of_points, weakest, parts = open_directions(seen, *how)
+    if held is None:
+        of_cameras = max(missing_by_count(seen), of_cameras)
+    of_cameras += CAMERA * lost
+    views, points = (int(np.count_nonzero(part)) for part in held or ((), ()))
     if fixed is not None:
         full -= CAMERA * views + POINT * points
         full += GAUGE - missing_beside((found.P[fixed[0]], found.Q[fixed[1]]))

@@ -23,6 +23,9 @@ __all__ = ["open_directions", "suits"]
 
 Array = NDArray[np.float64]
 
+#: Which views (n,) and points (m,) are no unknowns.
+Held = tuple[NDArray[np.bool_], NDArray[np.bool_]]
+
 #: An eigenvalue of N below this, where W of the covariant damping is one, is rounding.
 _ROUNDING = 1e-11
 
@@ -47,12 +50,17 @@ def suits(system: BundleSystem) -> bool:
 
 
 def open_directions(
-    seen: Seen, frame: Frame, kernels: Table, workers: int, system: BundleSystem | None
+    seen: Seen,
+    frame: Frame,
+    kernels: Table,
+    workers: int,
+    system: BundleSystem | None,
+    held: Held | None = None,
 ) -> tuple[int, int, float, Array]:
     """Return how many directions beside the gauge N leaves open, and its least other eigenvalue.
 
     Those of the cameras, and those of single points, which spoil nothing else. Last, what part of
-    the weakest direction each camera has, (n,).
+    the weakest direction each camera has, (n,). Cameras and points that are held are no unknowns.
 
     In parameters in which W of the covariant damping is one, for which the basis does not matter.
     """
@@ -60,7 +68,7 @@ def open_directions(
         # Where a camera or a point is all but undefined, numbers overflow: it is open.
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             system = system or _normal_equations(seen, frame, kernels, workers)
-            found = _measured(system, kernels)
+            found = _measured(system, kernels, held)
     except np.linalg.LinAlgError:
         return 1, 0, 0.0, np.zeros(seen.n)
     return found if np.isfinite(found[2]) else (1, 0, 0.0, np.zeros(seen.n))
@@ -77,7 +85,9 @@ def _normal_equations(seen: Seen, frame: Frame, kernels: Table, workers: int) ->
     return problem.linearize(BundleState(Estimate(P.reshape(-1, 12), Q), 0.0))
 
 
-def _measured(system: BundleSystem, kernels: Table) -> tuple[int, int, float, Array]:
+def _measured(
+    system: BundleSystem, kernels: Table, held: Held | None
+) -> tuple[int, int, float, Array]:
     W = Covariant().blocks(system)
     # A point whose lines of sight are one leaves W singular, too.
     lifted = [
@@ -86,12 +96,19 @@ def _measured(system: BundleSystem, kernels: Table) -> tuple[int, int, float, Ar
     ]
     roots = [np.swapaxes(np.linalg.cholesky(blocks), 1, 2) for blocks in lifted]
     whitening = [np.asarray(np.linalg.inv(root)) for root in roots]
-    p, q, moves = _freedom(system, kernels, roots)
+    p, q, moves = _freedom(system, kernels, roots, held)
     n, a = p.shape
+    if held is not None:
+        whitening[0][held[0]] = 0.0
     white = system.tied(*whitening)
     U = white.U + p[:, :, None] * p[:, None, :]
-    open_points, V = _grounded(white.V + q[:, :, None] * q[:, None, :])
+    V = white.V + q[:, :, None] * q[:, None, :]
+    if held is not None:
+        U[held[0]], V[held[1]] = np.eye(a), np.eye(V.shape[1])
+    open_points, V = _grounded(V)
     T = whitening[1] @ np.asarray(np.swapaxes(np.linalg.inv(np.linalg.cholesky(V)), 1, 2))
+    if held is not None:
+        T[held[1]] = 0.0
     coupling = system.normal.coupling
     if n <= _FEW:
         less = coupling.schur(T, None)[0].dense().transpose(0, 2, 1, 3)
@@ -128,20 +145,35 @@ def _direction(S: Array, value: float) -> Array:
 
 
 def _freedom(
-    system: BundleSystem, kernels: Table, roots: list[Array]
+    system: BundleSystem, kernels: Table, roots: list[Array], held: Held | None
 ) -> tuple[Array, Array, Array]:
     """Return unit directions of the scales, and the changes of basis as S knows them, (12 n, 15).
 
-    What N does not see, S does not see in the cameras alone.
+    What N does not see, S does not see in the cameras alone. Of the changes, those that leave what
+    is held as it is.
     """
     p = np.einsum("nij,nj->ni", roots[0], system.cameras)
     q = np.einsum("nij,nj->ni", roots[1], system.points)
     p, q = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (p, q))
     estimate = system.model, kernels, system.cameras, system.points
-    cameras = roots[0] @ generators(*estimate)[0]
-    cameras = cameras - p[:, :, None] * np.einsum("ni,nik->nk", p, cameras)[:, None]
+    own = generators(*estimate)
+    cameras = _beside(p, roots[0] @ own[0])
+    if held is not None:
+        points = _beside(q, roots[1] @ own[1])
+        size = np.sqrt(np.sum(cameras**2, axis=(0, 1)) + np.sum(points**2, axis=(0, 1)))
+        both = (cameras[held[0]], points[held[1]])
+        stuck = np.concatenate([part.reshape(-1, len(size)) for part in both]) / size
+        values, combinations = np.linalg.svd(stuck)[1:]
+        free = np.append(values, np.zeros(len(size) - len(values))) < 1e-9
+        cameras = cameras @ (combinations[free].T / size[:, None])
     moves = np.linalg.qr(cameras.reshape(p.size, -1))[0]
     return p, q, np.asarray(moves)
+
+
+def _beside(scales: Array, columns: Array) -> Array:
+    """Return columns (n, d, k) without their parts along unit directions (n, d)."""
+    along = np.einsum("ni,nik->nk", scales, columns)
+    return np.asarray(columns - scales[:, :, None] * along[:, None])
 
 
 def _least(
