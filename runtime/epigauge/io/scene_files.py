@@ -44,7 +44,8 @@ def load_scene(path: PathLike, *, repeated: str = "keep", weak: str = "drop") ->
     COLMAP's, with (0.5, 0.5) in the middle of the first one. A file ``.txt``, ``.txt.bz2`` or
     ``.txt.gz`` is a problem of "Bundle Adjustment in the Large", its cameras of the model ``bal``.
     ``.out`` is Bundler's, with the names of the images in ``list.txt`` beside it, its cameras of
-    the model ``bal``. ``.npz`` is what `save_scene` writes: calibrated, affine or projective cameras.
+    the model ``bal``. ``.npz`` is what `save_scene` writes: calibrated, affine or projective
+    cameras.
 
     Parameters
     ----------
