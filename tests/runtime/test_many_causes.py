@@ -283,6 +283,13 @@ def test_weakest_names_what_moves() -> None:
     assert projective.weakest.startswith("cameras of views 5 (")
 
 
+def test_perspective_that_does_not_show_is_told_of_projective_cameras() -> None:
+    for times, expected in ((400.0, True), (1.0, False)):
+        tracks, scene = seen_from(times * ring(), cloud(1), 1, f=800.0 * times)
+        found = eg.bundle_adjust(tracks, scene.to_projective())
+        assert ("near-affine" in found.flags) is expected
+
+
 def test_networks_fall_into_parts() -> None:
     view, point = np.array([0, 1, 1, 2, 3, 4]), np.array([0, 0, 1, 1, 2, 2])
     (part,) = loose_parts(view, point, 5)

@@ -15,6 +15,7 @@ import typer
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
+from rich.table import Table
 
 import epigauge as eg
 from epigauge._options import Rigs as _Rigs
@@ -22,6 +23,7 @@ from epigauge.cli._common import (
     DONE,
     INTERRUPTED,
     NOT_CONVERGED,
+    check_target,
     choice,
     console,
     facts,
@@ -37,6 +39,12 @@ from epigauge.io._npz_scene import write_npz_scene
 from epigauge.io.output import arrays_of_result
 from epigauge.io.scene_files import is_scene_file, scene_content
 from epigauge.multi_view.display import Display, display
+
+#: Views up to which standard deviations are told unasked, and rows of their table.
+_TOLD, _ROWS = 200, 24
+
+#: Points that are the datum of what is told of precision.
+_DATUM = 200
 
 _POINT, _CAMERA = (90, 140, 190), (224, 122, 31)
 
@@ -128,11 +136,18 @@ class SceneJob:
         raise ArgumentError("--fix-view", f"is {name!r:.60}", needed)
 
     def run(
-        self, options: Mapping[str, Any], plots: Sequence[Path], outputs: Sequence[Path], json: bool
+        self,
+        options: Mapping[str, Any],
+        plots: Sequence[Path],
+        outputs: Sequence[Path],
+        json: bool,
+        precision: Path | None = None,
     ) -> int:
         """Adjust the scene and write what is asked for; return the exit code."""
         for path in outputs:
             self._check_target(path)
+        if precision is not None:
+            check_target(precision, ".png", ".svg")
         out = console()
         begin = time.perf_counter()
         with watching(out, len(self.tracks), "adjustment", not json) as watch:
@@ -145,11 +160,13 @@ class SceneJob:
                 callback=watch,
                 **options,
             )
-        answer = _SceneAnswer(self, result, time.perf_counter() - begin)
+        answer = _SceneAnswer(self, result, time.perf_counter() - begin, str(options["loss"]))
         for path in outputs:
             answer.save(path)
         for path in plots:
             answer.draw(path)
+        if precision is not None:
+            answer.draw_precision(precision)
         if json:
             write_json(answer.document())
         else:
@@ -188,10 +205,46 @@ class SceneJob:
 class _SceneAnswer:
     """An adjusted scene and the forms it is given in."""
 
-    def __init__(self, job: SceneJob, result: eg.BundleResult, seconds: float) -> None:
-        self.job, self.result, self.seconds = job, result, seconds
+    def __init__(self, job: SceneJob, result: eg.BundleResult, seconds: float, loss: str) -> None:
+        self.job, self.result, self.seconds, self.loss = job, result, seconds, loss
         assert isinstance(result.reconstruction, eg.MetricReconstruction)
         self.scene = result.reconstruction
+
+    @cached_property
+    def covariance(self) -> eg.MetricCovariance | ArgumentError:
+        """How sure it is, or why nobody can say.
+
+        By inner constraints over the points that are seen most: over all, the farthest ones, whose
+        places the noise makes, would be the datum.
+        """
+        tracks, result = self.job.tracks, self.result
+        weights = np.where(result.rejected, 0.0, tracks.weights)
+        counts = np.bincount(tracks.point, weights > 0.0, minlength=tracks.n_points)
+        most = np.argsort(-np.where(self.frame.shown, counts, 0.0), kind="stable")[:_DATUM]
+        try:
+            return eg.covariance(
+                tracks.weighted(weights),
+                self.scene,
+                eg.gauge.inner(points=most[self.frame.shown[most]].tolist()),
+                refine=self.job.refine,
+                fixed_views=self.job.fixed,
+                loss=self.loss,
+                loss_scale_px=result.loss_scale_px or "auto",
+            )
+        except ArgumentError as error:
+            return error
+
+    @property
+    def sure(self) -> eg.MetricCovariance | None:
+        """The covariance where there is one."""
+        return None if isinstance(self.covariance, ArgumentError) else self.covariance
+
+    @property
+    def intrinsics(self) -> list[tuple[int, str, float, float, str]]:
+        """Camera, name, value, sigma and unit of each refined parameter; few views only."""
+        if self.job.tracks.n_views > _TOLD or self.job.refine == "pose" or self.sure is None:
+            return []
+        return self.sure.intrinsic_rows()
 
     @cached_property
     def frame(self) -> Display:
@@ -214,7 +267,10 @@ class _SceneAnswer:
         scene = document.pop("reconstruction")
         names = self.job.tracks.names
         document |= scene.pop("cameras") | scene
-        return document | self.more() | {"names": plain(names), "notes": plain(self.job.notes)}
+        keys = "camera", "name", "value", "sigma", "unit"
+        rows = [dict(zip(keys, row, strict=True)) for row in self.intrinsics]
+        more = {"names": plain(names), "notes": plain(self.job.notes), "intrinsics": rows}
+        return document | self.more() | more
 
     def save(self, path: Path) -> None:
         """Write the scene with the result, a cloud of points and centres, or residuals."""
@@ -237,11 +293,21 @@ class _SceneAnswer:
         if path.suffix.lower() == ".html":
             from epigauge.reports import save_viewer
 
-            save_viewer(path, self.result, tracks, title, frame=self.frame)
+            options: Any = {"frame": self.frame, "covariance": self.sure}
+            save_viewer(path, self.result, tracks, title, **options)
             return
         from epigauge.plots import plot_bundle, save_figure
 
         save_figure(plot_bundle(self.result, tracks, title, frame=self.frame), path)
+
+    def draw_precision(self, path: Path) -> None:
+        """Draw how sure it is."""
+        from epigauge.plots import plot_precision, save_figure
+
+        if isinstance(self.covariance, ArgumentError):
+            raise self.covariance
+        tracks, title = self.job.tracks, named(self.job.path)
+        save_figure(plot_precision(self.covariance, tracks, title, frame=self.frame), path)
 
     def report(self, out: Console, interrupted: bool) -> None:
         """Tell people on stderr what came out."""
@@ -272,6 +338,22 @@ class _SceneAnswer:
         if self.job.notes:
             rows["file"] = escape("; ".join(self.job.notes))
         out.print(facts(escape(shown(self.job.path)), rows))
+        if known := self.intrinsics:
+            out.print(_table(known))
         if not (result.success or interrupted):
             why = result.message if result.status <= 0 or not result.flags else result.flags[0]
             out.print(f"[bold red]not to be trusted:[/] {escape(why)}")
+
+
+def _table(rows: Sequence[tuple[int, str, float, float, str]]) -> Table:
+    """Return a table of parameters with their standard deviations, the first ones of many."""
+    table = Table(box=None, pad_edge=False)
+    for name in ("camera", "parameter", "value", "sigma", "unit"):
+        table.add_column(name, justify="left" if name in ("parameter", "unit") else "right")
+    for camera, name, value, sigma, unit in rows[:_ROWS]:
+        table.add_row(
+            str(camera), name, f"{value:.8g}", f"{sigma:.3g}", "" if unit == "1" else unit
+        )
+    if len(rows) > _ROWS:
+        table.caption = f"{len(rows) - _ROWS} more: --json has them"
+    return table

@@ -91,6 +91,12 @@ TracksFile = Annotated[
 ]
 
 
+Precision = Annotated[
+    Path | None,
+    typer.Option(help="Of a scene: draw sigma of intrinsics and maps of precision, PNG or SVG."),
+]
+
+
 def bundle(
     tracks: TracksFile,
     method: Annotated[Method, choice(Method, "Strategy.")] = "covariant",
@@ -138,6 +144,7 @@ def bundle(
             show_default=False,
         ),
     ] = None,
+    precision: Precision = None,
     refine: Refine = None,
     fix_view: FixView = None,
     rigs: Rigs = "keep",
@@ -176,7 +183,10 @@ def bundle(
         asked |= {"backend": backend, "gauge_mode": gauge_mode, "robust": robust}
         refuse_options(others)
         scene = SceneJob(tracks, refine, fix_view or [], rigs, y_up, image_size)
-        return scene.run(asked, plots, outputs, json)
+        return scene.run(asked, plots, outputs, json, precision)
+    if precision is not None:
+        was = "is given with tracks, whose cameras are not calibrated"
+        raise ArgumentError("--precision", was, "a scene")
     for path in plots:
         check_target(path, ".png", ".svg", ".html")
     for path in outputs:

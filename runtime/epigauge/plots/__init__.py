@@ -7,6 +7,14 @@ from epigauge.plots._style import save_figure
 from epigauge.plots.comparison import plot_comparison
 from epigauge.plots.many_views import plot_bundle
 from epigauge.plots.pair import plot_pair
+from epigauge.plots.precision import plot_precision
 from epigauge.plots.two_views import plot_refinement
 
-__all__ = ["plot_bundle", "plot_comparison", "plot_pair", "plot_refinement", "save_figure"]
+__all__ = [
+    "plot_bundle",
+    "plot_comparison",
+    "plot_pair",
+    "plot_precision",
+    "plot_refinement",
+    "save_figure",
+]

@@ -46,6 +46,22 @@ function projector(view, width, height) {
   };
 }
 
+// The half-axes of an ellipse with the covariance (a, b; b, c), and the angle of the first.
+function ellipseOf(a, b, c) {
+  const middle = (a + c) / 2, apart = Math.hypot((a - c) / 2, b);
+  return [Math.sqrt(middle + apart), Math.sqrt(Math.max(middle - apart, 0)), 0.5 * Math.atan2(2 * b, a - c)];
+}
+
+// Largest and least eigenvalue of a symmetric matrix, given by its upper triangle.
+function extremes([xx, xy, xz, yy, yz, zz]) {
+  const mean = (xx + yy + zz) / 3, a = xx - mean, b = yy - mean, c = zz - mean;
+  const size = Math.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6);
+  if (!(size > 0)) return [mean, mean];
+  const det = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz);
+  const angle = Math.acos(clamp(det / (2 * size ** 3), -1, 1)) / 3;
+  return [mean + 2 * size * Math.cos(angle), mean + 2 * size * Math.cos(angle + (2 * Math.PI) / 3)];
+}
+
 // The part of a segment in front of the viewer, projected, or null.
 function segment(project, a, b) {
   const p = project(a), q = project(b);
@@ -190,8 +206,39 @@ function start() {
       for (let k = 1; k < data.cameras.length; k++) line(project, data.cameras[k - 1].centre, data.cameras[k].centre);
     });
     if (by("cameras").checked) strokes(CAMERA, 1.2, () => { for (const camera of data.cameras) pyramid(project, camera); });
+    if (data.spread && by("ellipsoids").checked) paintEllipsoids(project);
     paintMarked(project);
     paintAxes();
+  }
+
+  const magnified = () => data.spread.times * 10 ** Number(by("magnify").value);
+  const block = (name, k) => data.spread[name].slice(6 * k, 6 * k + 6);
+
+  // Outlines of the ellipsoids, as from far away: the covariance across the line of sight.
+  function paintEllipsoids(project) {
+    const { right, up } = axesOf(view.yaw, view.pitch), focal = FIELD * Math.min(width, height), times = magnified();
+    const along = ([xx, xy, xz, yy, yz, zz], u, v) =>
+      u[0] * (xx * v[0] + xy * v[1] + xz * v[2]) + u[1] * (xy * v[0] + yy * v[1] + yz * v[2]) + u[2] * (xz * v[0] + yz * v[1] + zz * v[2]);
+    const outline = (p, C) => {
+      const scale = (times * focal) / p[2];
+      const [a, b, angle] = ellipseOf(along(C, right, right), along(C, right, up), along(C, up, up));
+      if (!(p[2] > NEAR) || !(a * scale > 0.6) || a * scale > 4 * width) return;
+      pen.moveTo(p[0] + a * scale * Math.cos(angle), p[1] - a * scale * Math.sin(angle));
+      pen.ellipse(p[0], p[1], a * scale, b * scale, -angle, 0, 2 * Math.PI);
+    };
+    by("times").textContent = "\u00d7 " + (times >= 100 ? times.toFixed(0) : times.toPrecision(2));
+    pen.globalAlpha = count > 2000 ? 0.25 : 0.55;
+    strokes("#3b3b8f", 0.8, () => { for (let k = 0; k < count; k++) outline([xs[k], ys[k], zs[k]], block("points", k)); });
+    pen.globalAlpha = 0.9;
+    if (by("cameras").checked) strokes(CAMERA, 1, () => data.cameras.forEach((camera, k) => outline(project(camera.centre), block("cameras", k))));
+    pen.globalAlpha = 1;
+  }
+
+  // Largest and least standard deviation in the unit of the scene, in words.
+  function sureness(name, k) {
+    if (!data.spread) return [];
+    const [high, low] = extremes(block(name, k)).map((value) => data.spread.unit * Math.sqrt(Math.max(value, 0)));
+    return high > 0 ? [`sigma ${low.toPrecision(2)} to ${high.toPrecision(2)} (unit of the scene)`] : [];
   }
 
   function paintGrid(project) {
@@ -275,12 +322,12 @@ function start() {
   function describe(thing) {
     if (thing.point === undefined) {
       const camera = data.cameras[thing.camera];
-      return [camera.name || `view ${camera.number}`, `${camera.points} points` + (camera.rms === null ? "" : `, RMS ${camera.rms.toPrecision(3)} px`)];
+      return [camera.name || `view ${camera.number}`, `${camera.points} points` + (camera.rms === null ? "" : `, RMS ${camera.rms.toPrecision(3)} px`), ...sureness("cameras", thing.camera)];
     }
     const k = thing.point, at = data.points.slice(3 * k, 3 * k + 3).map((value) => value.toFixed(3));
     const views = seenBy(k).map((i) => data.cameras[i].name || data.cameras[i].number);
     const listed = views.slice(0, 12).join(", ") + (views.length > 12 ? ", \u2026" : "");
-    return [`point ${data.number[k]}`, `RMS ${data.rms[k].toPrecision(3)} px in ${views.length} views: ${listed}`, `(${at.join(", ")})`];
+    return [`point ${data.number[k]}`, `RMS ${data.rms[k].toPrecision(3)} px in ${views.length} views: ${listed}`, `(${at.join(", ")})`, ...sureness("points", k)];
   }
 
   function hover(x, y) {
@@ -387,8 +434,8 @@ function start() {
     draw();
   });
 
-  for (const id of ["cameras", "path", "grid"]) by(id).addEventListener("change", draw);
-  for (const id of ["size", "scale"]) by(id).addEventListener("input", draw);
+  for (const id of ["cameras", "path", "grid", "ellipsoids"]) by(id).addEventListener("change", draw);
+  for (const id of ["size", "scale", "magnify"]) by(id).addEventListener("input", draw);
   by("colour").addEventListener("change", colour);
   by("reset").addEventListener("click", () => turn(home.yaw, home.pitch));
   by("above").addEventListener("click", () => turn(0, Math.PI / 2));
@@ -396,6 +443,7 @@ function start() {
   by("side").addEventListener("click", () => turn(-Math.PI / 2, 0));
 
   by("path").checked = data.sequence;
+  by("sure").style.display = data.spread ? "" : "none";
   const resize = () => {
     const ratio = window.devicePixelRatio || 1;
     width = Math.max(canvas.clientWidth, 1);

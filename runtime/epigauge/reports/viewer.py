@@ -16,12 +16,14 @@ from epigauge.multi_view.adjust import BundleResult
 from epigauge.multi_view.display import Display, camera_spacing, display, is_sequence
 from epigauge.multi_view.tracks import Tracks
 from epigauge.reports._page import save_page
+from epigauge.uncertainty.covariance import MetricCovariance
 
 __all__ = ["save_viewer"]
 
 Array = NDArray[np.float64]
 
 _PYRAMID = (0.06, 0.4)  # length of a camera, in usual distances of a point from the middle
+_ELLIPSOID = 0.03  # half-axis of a usual ellipsoid, in usual distances of a point from the middle
 _DOT = (2.0, 5.5)  # diameter of a point, in pixels of the screen
 _STRAY = 0.005  # share of the points left out at either end when the view is fitted
 _FITTED = 500  # points that the view is fitted to
@@ -37,6 +39,7 @@ def save_viewer(
     view_numbers: ArrayLike | None = None,
     point_numbers: ArrayLike | None = None,
     notes: Sequence[str] = (),
+    covariance: MetricCovariance | None = None,
 ) -> None:
     """Write points and cameras as a page to look at them from all sides.
 
@@ -61,6 +64,8 @@ def save_viewer(
         What to call views and points, if not by their indices.
     notes : sequence of str
         Sentences to show below the title.
+    covariance : MetricCovariance, optional
+        Of a calibrated reconstruction: error ellipsoids of points and cameras are drawn, magnified.
 
     Raises
     ------
@@ -83,6 +88,8 @@ def save_viewer(
         lead += ". Calibrated cameras: the shape is true, its size is not known."
     else:
         lead += ". A basis to look at, no calibration: nothing can be measured in it."
+    if covariance is not None:
+        lead += f" Ellipsoids of one sigma, noise {covariance.noise_px:.3g} px, magnified."
     hidden = tracks.n_points - int(shown.shown.sum())
     if hidden:
         lead += f" {hidden} points far away or behind a camera are not shown."
@@ -92,7 +99,10 @@ def save_viewer(
         "lead": lead,
         "warning": _warning(result, shown),
     }
-    save_page(path, "viewer", parts, _data(shown, tracks, result.fun, views, points))
+    data = _data(shown, tracks, result.fun, views, points)
+    kept = np.asarray(data.pop("kept"))
+    data["spread"] = None if covariance is None else _spread(shown, covariance, kept)
+    save_page(path, "viewer", parts, data)
 
 
 def _warning(result: BundleResult, shown: Display) -> str:
@@ -126,6 +136,7 @@ def _data(
     low, high = around.min(axis=0), around.max(axis=0)
     spacing = camera_spacing(shown.centres)
     return {
+        "kept": kept,
         "points": _rounded(X.ravel(), 4),
         "number": point_numbers[kept].tolist(),
         "rms": _rounded(rms[kept], 4),
@@ -160,6 +171,30 @@ def _data(
         "bounds": [_rounded(point, 3) for point in around],
         "grid": [np.floor(low[:2]).tolist(), np.ceil(high[:2]).tolist(), float(low[2])],
     }
+
+
+def _spread(
+    shown: Display, covariance: MetricCovariance, kept: NDArray[np.bool_]
+) -> dict[str, Any]:
+    """Return covariances where they are shown, as six numbers each, and how much to magnify them.
+
+    Of the unit of the scene `unit` are one of the picture.
+    """
+    linear = np.linalg.inv(shown.T[:3, :3])
+    unit = float(np.cbrt(abs(np.linalg.det(shown.T[:3, :3]))))
+    points, centres = (
+        linear @ blocks @ linear.T
+        for blocks in (covariance.point_blocks[kept], covariance.centre_blocks)
+    )
+    far = np.asarray(~np.isfinite(covariance.std.points[kept]).all(axis=1))
+    points = np.where(far[:, None, None], 0.0, points)
+    size = np.sqrt(np.einsum("mii->m", points) / 3.0)
+    usual = float(np.median(size[size > 0.0])) if (size > 0.0).any() else 0.0
+    found: dict[str, Any] = {"unit": unit, "times": _ELLIPSOID / usual if usual > 0.0 else 1.0}
+    for name, blocks in (("points", points), ("cameras", centres)):
+        six = blocks[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        found[name] = [float(f"{value:.4g}") for value in six.ravel()]
+    return found
 
 
 def _without_strays(X: Array) -> Array:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from epigauge._results import Result
 from epigauge.bundle.similarity import Similarity
-from epigauge.cameras import MetricReconstruction
+from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.uncertainty.datum import Projection, projection
 from epigauge.uncertainty.inverse import Inverse, Part, spread
@@ -139,6 +139,52 @@ class MetricCovariance(Result):
             Zero where a parameter is not refined.
         """
         return self.between(("intrinsics", c), ("intrinsics", c))
+
+    def intrinsic_rows(self) -> list[tuple[int, str, float, float, str]]:
+        """Return each refined parameter of the cameras with its standard deviation.
+
+        Returns
+        -------
+        list of tuple
+            Camera, name, value, standard deviation, unit.
+        """
+        cameras = self.reconstruction.cameras
+        model = camera_model(cameras.model)
+        found = []
+        for c, (params, std) in enumerate(zip(cameras.params, self.std.intrinsics, strict=True)):
+            for name, unit, value, sigma in zip(
+                model.adjusted, model.units, params, std, strict=False
+            ):
+                if sigma > 0.0:
+                    found.append((c, name, float(value), float(sigma), unit))
+        return found
+
+    @cached_property
+    def centre_blocks(self) -> Array:
+        """Return the covariances of the centres of all views, (n, 3, 3)."""
+        return self.noise_px**2 * self._pose_blocks[:, 3:, 3:]
+
+    @cached_property
+    def point_blocks(self) -> Array:
+        """Return the covariances of all points, (m, 3, 3); of those at infinity as computed."""
+        return np.asarray(self.noise_px**2 * self._space @ self._local_points @ self._space.T)
+
+    @cached_property
+    def _local_points(self) -> Array:
+        """Blocks of points as computed with, (m, 3, 3), without the noise."""
+        low = self._projection
+        return spread(self._inverse.diagonals[1], low.points, low.M)
+
+    @cached_property
+    def _own_blocks(self) -> Array:
+        """Blocks of own tangents of all views, (n, d, d), without the noise."""
+        low = self._projection
+        return spread(self._inverse.diagonals[0], low.cameras, low.M)
+
+    @cached_property
+    def _pose_blocks(self) -> Array:
+        own = self._own_blocks[:, :_POSE, :_POSE]
+        return np.asarray(self._poses @ own @ np.swapaxes(self._poses, 1, 2))
 
     def point(self, j: int) -> Array:
         """Return the covariance of a point.
@@ -299,31 +345,16 @@ class MetricCovariance(Result):
     def std(self) -> Std:
         """Return the standard deviations of everything."""
         d = self._inverse.sizes[1]
-        low, middle = self._projection, self._projection.M
-        blocks, points = self._inverse.diagonals
-        blocks = spread(blocks, low.cameras, middle)
-        points = spread(points, low.points, middle)
-        poses = (
-            self.noise_px**2
-            * self._poses
-            @ blocks[:, :_POSE, :_POSE]
-            @ np.swapaxes(self._poses, 1, 2)
-        )
-        # The diagonal of S X S^T, X the covariance of a point.
-        both = self._space[:, :, None] * self._space[:, None, :]
-        turned = points.reshape(-1, 9) @ both.reshape(3, 9).T
         cameras = self.reconstruction.cameras
         first = np.unique(cameras.camera_of_view, return_index=True)[1]
+        # The diagonal of S X S^T, X the covariance of a point.
+        both = self._space[:, :, None] * self._space[:, None, :]
+        turned = self._local_points.reshape(-1, 9) @ both.reshape(3, 9).T
         of_points = np.sqrt(np.maximum(self.noise_px**2 * turned, 0.0))
         of_points[self._inverse.at_infinity] = np.inf
-        own = np.einsum("nii->ni", blocks)[first, _POSE:d] * self.noise_px**2
-        of_poses = np.sqrt(np.maximum(np.einsum("nii->ni", poses), 0.0))
-        return Std(
-            of_poses[:, :3],
-            of_poses[:, 3:],
-            np.sqrt(np.maximum(own, 0.0)),
-            of_points,
-        )
+        own = _roots(self._own_blocks)[first, _POSE:d]
+        of_poses = self.noise_px * _roots(self._pose_blocks)
+        return Std(of_poses[:, :3], of_poses[:, 3:], self.noise_px * own, of_points)
 
     @cached_property
     def _poses(self) -> Array:
@@ -370,6 +401,11 @@ class MetricCovariance(Result):
             return _Part((index, None), np.pad(self._poses[index], ((0, 0), (0, d - _POSE))))
         first = int(np.argmax(cameras.camera_of_view == index))
         return _Part((first, None), np.eye(d)[_POSE:])
+
+
+def _roots(blocks: Array) -> Array:
+    """Return the roots of the diagonals of blocks (k, b, b)."""
+    return np.asarray(np.sqrt(np.maximum(np.einsum("kii->ki", blocks), 0.0)))
 
 
 @dataclass(frozen=True)
