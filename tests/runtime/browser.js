@@ -28,7 +28,7 @@ function element(id) {
     offsetWidth: 120,
     offsetHeight: 60,
     checked: true,
-    value: { colour: "rms", size: "1", scale: "1" }[id],
+    value: { colour: "rms", size: "1", scale: "1", magnify: "0" }[id],
     textContent: id === "data" ? json : "",
     parts: [],
     getContext: () => pen,
@@ -54,8 +54,8 @@ function paint() {
   return { ...counts };
 }
 
-const exported = "{ axesOf, projector, farToNear, segment }";
-const { axesOf, projector, farToNear, segment } = new Function(`${script}; return ${exported};`)();
+const exported = "{ axesOf, projector, farToNear, segment, ellipseOf, extremes }";
+const { axesOf, projector, farToNear, segment, ellipseOf, extremes } = new Function(`${script}; return ${exported};`)();
 const by = document.getElementById, canvas = by("scene"), tip = by("tip"), said = {};
 
 said.first = paint();
@@ -105,7 +105,8 @@ for (const kind of ["views", "height", "rms"]) {
   said[kind] = [by("what").textContent, by("low").textContent, by("high").textContent];
   paint();
 }
-for (const id of ["cameras", "path", "grid"]) by(id).checked = false;
+said.times = by("times").textContent;
+for (const id of ["cameras", "path", "grid", "ellipsoids"]) by(id).checked = false;
 by("grid").fire("change");
 said.bare = paint();
 
@@ -114,4 +115,6 @@ const look = projector({ yaw: 0, pitch: 0, centre: [0, 0, 0], distance: 5 }, 800
 said.places = [look([0, 0, 0]), look([1, 0, 0]), look([0, 0, 1]), look([0, 1, 0])];
 said.cut = [segment(look, [0, 0, 0], [0, -20, 0]), segment(look, [0, -9, 0], [0, -20, 0])];
 said.order = [...farToNear(new Float32Array([3, -1, 9, 5, 0.001]), 0.02).order];
+said.ellipse = ellipseOf(3, 1, 2);
+said.extremes = extremes([3, 1, 0.5, 2, 0.2, 1]);
 console.log(JSON.stringify(said));

@@ -212,3 +212,40 @@ def test_rigs_are_given_up_only_on_request(run, tmp_path) -> None:
     options = ("--refine", "pose", "-o", tmp_path / "o")
     assert run("bundle", tmp_path, *options, "--rigs", "drop")[0] == 0
     assert pycolmap.Reconstruction(tmp_path / "o").num_frames() == 6
+
+
+def test_precision_is_told_in_a_table_in_json_and_in_pictures(run, folder, tmp_path) -> None:
+    pytest.importorskip("matplotlib", reason="pictures need matplotlib")
+    page, picture = tmp_path / "x.html", tmp_path / "p.png"
+    options = ["--refine", "f,k", "--plot", page, "--precision", picture]
+    code, _, err = run("bundle", folder, *options)
+    assert code == 0
+    lines = err.splitlines()
+    head = next(k for k, line in enumerate(lines) if line.split()[:2] == ["camera", "parameter"])
+    told = [line.split() for line in lines[head + 1 :]]
+    tracks, start = eg.load_scene(folder)
+    found = eg.bundle_adjust(tracks, start, refine=("f", "k")).reconstruction
+    spread = eg.covariance(tracks, found, refine=("f", "k"))
+    rows = spread.intrinsic_rows()
+    assert [row[1] for row in rows] == ["f", "k", "f", "k"]
+    for line, (camera, name, value, sigma, unit) in zip(told, rows, strict=False):
+        assert line[:2] == [str(camera), name]
+        assert float(line[2]) == pytest.approx(value, rel=1e-6)
+        assert float(line[3]) == pytest.approx(sigma, rel=1e-2)
+        assert line[4:] == ([unit] if unit != "1" else [])
+    assert '"spread":{' in page.read_text(encoding="utf-8")
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    document = json.loads(run("bundle", folder, "--refine", "f,k", "--json")[1])
+    for entry, row in zip(document["intrinsics"], rows, strict=True):
+        assert (entry["camera"], entry["name"], entry["unit"]) == (row[0], row[1], row[4])
+        assert entry["sigma"] == pytest.approx(row[3], rel=1e-6)
+    assert json.loads(run("bundle", folder, "--refine", "pose", "--json")[1])["intrinsics"] == []
+
+
+def test_precision_is_of_scenes_only(run, tmp_path) -> None:
+    scene = eg.multi_view_scene(n_points=30, seed=1)
+    path = tmp_path / "t.npz"
+    np.savez(path, view=scene.tracks.view, point=scene.tracks.point, xy=scene.tracks.xy)
+    code, _, err = run("bundle", path, "--precision", tmp_path / "p.png")
+    assert code != 0
+    assert "--precision" in err

@@ -342,3 +342,23 @@ def test_the_report_of_a_metrology_network_is_reached(network: Any, data_dir: Pa
                 full[3 * i : 3 * i + 3, 3 * j : 3 * j + 3],
                 atol=1e-8 * np.abs(full).max(),
             )
+
+
+def test_points_far_away_do_not_spoil_a_datum_of_near_ones() -> None:
+    """Three points at ten million times the distance: the same as in a scene without them."""
+    tracks, scene = metric_scene("PINHOLE", 11, n_points=25, visible=1.0)
+    far = np.r_[scene.X, 1e7 * np.array([[1.0, 0.2, 0.1], [-0.4, 0.3, 1.0], [0.2, -0.1, -1.0]])]
+    wide = eg.MetricReconstruction(scene.R, scene.t, far, scene.cameras)
+    seen = wide.depths(eg.Tracks(*np.nonzero(np.ones((4, 28))), np.zeros((112, 2)))) > 0.0
+    view, point = np.nonzero(np.ones((4, 28)))
+    order = np.lexsort((view, point))
+    keep = (point[order] < 25) | seen
+    blank = eg.Tracks(view[order][keep], point[order][keep], np.zeros((int(keep.sum()), 2)))
+    with_far = eg.Tracks(blank.view, blank.point, wide.project(blank))
+    near = list(range(25))
+    options: dict[str, Any] = {"noise_px": 1.0, "refine": "pose"}
+    a = eg.covariance(tracks, scene, eg.gauge.inner(points=near), **options)
+    b = eg.covariance(with_far, wide, eg.gauge.inner(points=near), **options)
+    # Far points tell of the rotations, and nothing but that.
+    assert (b.std.points[:25] <= a.std.points * (1.0 + 1e-6)).all()
+    assert (b.std.points[:25] >= 0.3 * a.std.points).all()

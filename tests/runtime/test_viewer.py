@@ -17,6 +17,8 @@ from epigauge.errors import ArgumentError
 from epigauge.multi_view.display import display
 from epigauge.reports.viewer import save_viewer
 
+from tests.metric_scenes import metric_scene
+
 SCENE = eg.multi_view_scene(n_points=50, noise_px=0.5, distance=4.0, seed=6, visible=0.8)
 RESULT = eg.bundle_adjust(SCENE.tracks)
 FRAME = display(RESULT.reconstruction, SCENE.tracks)
@@ -130,3 +132,39 @@ def test_script_draws_turns_and_names_what_is_under_the_pointer(tmp_path, empty)
     assert said["cut"][0][1][2] == pytest.approx(0.02, rel=0.02)
     assert said["cut"][1] is None
     assert said["order"] == [2, 3, 0]
+
+
+def test_ellipsoids_are_those_of_the_covariance_where_it_is_shown(tmp_path) -> None:
+    """Covariances of the picture, turned back and scaled, are those of the scene."""
+    tracks, scene = metric_scene("SIMPLE_RADIAL", 2, n_points=40, noise_px=0.3)
+    result = eg.bundle_adjust(tracks, scene, refine=("f",))
+    spread = eg.covariance(tracks, result.reconstruction, refine=("f",))
+    frame = display(result.reconstruction, tracks)
+    path = tmp_path / "view.html"
+    save_viewer(path, result, tracks, frame=frame, covariance=spread)
+    data = data_of(path.read_text(encoding="utf-8"))
+    L = frame.T[:3, :3]
+    for name in ("points", "cameras"):
+        for k in (0, 2):
+            xx, xy, xz, yy, yz, zz = data["spread"][name][6 * k : 6 * k + 6]
+            C = L @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ L.T
+            point = name == "points"
+            known = spread.point(data["number"][k]) if point else spread.camera(k)[3:, 3:]
+            np.testing.assert_allclose(C, known, rtol=2e-3, atol=2e-3 * np.abs(known).max())
+    np.testing.assert_allclose(L @ L.T, data["spread"]["unit"] ** 2 * np.eye(3), atol=1e-9)
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("no node to run the script of the page")
+    run = subprocess.run([node, BROWSER, path], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    said = json.loads(run.stdout)
+    assert said["first"]["ellipse"] == len(data["number"]) + len(data["cameras"])
+    assert "ellipse" not in said["bare"]
+    assert said["times"].startswith("\u00d7 ")
+    assert any(row.startswith("sigma ") for row in said["tip"][1].splitlines())
+    values, axes = np.linalg.eigh([[3.0, 1.0], [1.0, 2.0]])
+    long, short, angle = said["ellipse"]
+    np.testing.assert_allclose([long**2, short**2], values[::-1])
+    assert abs(np.array([np.cos(angle), np.sin(angle)]) @ axes[:, 1]) == pytest.approx(1.0)
+    known = np.linalg.eigvalsh([[3.0, 1.0, 0.5], [1.0, 2.0, 0.2], [0.5, 0.2, 1.0]])
+    np.testing.assert_allclose(said["extremes"], known[[2, 0]])

@@ -76,11 +76,9 @@ def projection(
         none = np.zeros((*inverse.sizes[:2], 0)), np.zeros((len(points), 3, 0))
         return Projection(*none, np.zeros((0, 0)))
     C = _conditions(datum, cameras, points, motions.cameras, motions.points)
-    if C[0].shape[2] > free and not _is_inner(datum):
-        C = _first(C, G, free)
-    elif C[0].shape[2] > free:
-        C = C[0] @ motions.open, C[1] @ motions.open
-    return onto(C, inverse, datum)
+    if _is_inner(datum):
+        return _projection(*_orthonormal(C, motions.open, G, datum), inverse)
+    return onto(_first(C, G, free) if C[0].shape[2] > free else C, inverse, datum)
 
 
 def onto(C: tuple[Array, Array], inverse: Inverse | Sandwich, datum: Any) -> Projection:
@@ -105,17 +103,50 @@ def onto(C: tuple[Array, Array], inverse: Inverse | Sandwich, datum: Any) -> Pro
     product = products(C, G)
     values = np.linalg.svd(product, compute_uv=False)
     if len(product) < free or not values[-1] > 1e-9 * values[0]:
-        raise ArgumentError(
-            "gauge", f"is {datum!r:.80}, which leaves motions free", "points or views apart"
-        )
+        raise _leaves_free(datum)
     # K = (C G)^-1 C: S = I - G K.
     back = np.asarray(np.linalg.inv(product).T)
-    K = combined(C[0], back), combined(C[1], back)
+    return _projection((combined(C[0], back), combined(C[1], back)), G, inverse)
+
+
+def _projection(
+    K: tuple[Array, Array], G: tuple[Array, Array], inverse: Inverse | Sandwich
+) -> Projection:
+    """Return S X S^T for S = I - G K."""
     T = inverse.apply(*K)
     R = products(K, T)
     L = np.concatenate([G[0], T[0]], axis=2), np.concatenate([G[1], T[1]], axis=2)
-    one, zero = np.eye(free), np.zeros((free, free))
+    one, zero = np.eye(len(R)), np.zeros((len(R), len(R)))
     return Projection(*L, np.block([[0.5 * (R + R.T), -one], [-one, zero]]))
+
+
+def _orthonormal(
+    C: tuple[Array, Array], open_: Array, G: tuple[Array, Array], datum: Any
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Return K and motions G with S = I - G K for inner constraints: those of some parts.
+
+    Of few points among others far away these are small and alike: the motions are combined so that
+    they are orthonormal on the parts, by a decomposition that does not square their condition.
+    """
+    n, m = len(C[0]), len(C[1])
+    parts = [combined(part, open_).reshape(-1, open_.shape[1]) for part in C]
+    whole = np.concatenate(parts)
+    size = np.linalg.norm(whole, axis=0)
+    if not (size > 0.0).all():
+        raise _leaves_free(datum)
+    Q, R = np.linalg.qr(whole / size)
+    values = np.linalg.svd(R, compute_uv=False)
+    if not values[-1] > 1e-11 * values[0]:
+        raise _leaves_free(datum)
+    back = np.linalg.inv(R) / size[:, None]
+    count = len(parts[0])
+    K = Q[:count].reshape(n, -1, Q.shape[1]), Q[count:].reshape(m, 3, -1)
+    return K, (combined(G[0], back), combined(G[1], back))
+
+
+def _leaves_free(datum: Any) -> ArgumentError:
+    was = f"is {datum!r:.80}, which leaves motions free"
+    return ArgumentError("gauge", was, "points or views apart")
 
 
 def _is_inner(datum: Any) -> bool:
