@@ -29,7 +29,6 @@ from typing import Any
 
 import colmap_databases
 import epigauge as eg
-import photographs
 from epigauge.errors import MissingPackageError
 
 CHECKOUT = Path(__file__).resolve().parents[1]
@@ -102,16 +101,9 @@ def run(page: Path, folder: Path) -> None:
 
 
 def provide(folder: Path) -> None:
-    """Write matches.csv, tracks.csv, database.db and, by OpenCV, photographs A.jpg and B.jpg."""
-    scene = eg.two_view_scene()
-    eg.save_matches(folder / "matches.csv", eg.Matches(x1=scene.x1, x2=scene.x2))
-    eg.save_tracks(folder / "tracks.csv", eg.multi_view_scene().tracks)
+    """Write the samples, as `epigauge samples .` does, and database.db."""
+    eg.samples.copy(folder)
     colmap_databases.Project().write(folder / "database.db")
-    with contextlib.suppress(ModuleNotFoundError):
-        import cv2
-
-        for name, image in zip("AB", photographs.rendered((0.6, 0.1, 0.2))[:2], strict=True):
-            cv2.imwrite(str(folder / f"{name}.jpg"), image)
 
 
 def commands(block: Block) -> Iterator[list[str]]:

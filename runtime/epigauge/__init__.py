@@ -10,7 +10,7 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
-    from epigauge import casadi, colmap, datasets, interop, kernels, verdicts
+    from epigauge import casadi, colmap, datasets, interop, kernels, samples, verdicts
     from epigauge.bundle.priors import (
         Distance,
         IntrinsicPrior,
@@ -127,6 +127,7 @@ __all__ = [
     "refine_fundamental",
     "refine_fundamental_batch",
     "reprojection_distances",
+    "samples",
     "sampson_distances",
     "save_matches",
     "save_reconstruction",
@@ -173,7 +174,10 @@ _WHERE = {
 }
 _MODULES = {
     **{name: name for name in ("arrays", "casadi", "colmap", "datasets", "interop", "kernels")},
-    **{name: name for name in ("errors", "images", "io", "lm", "plots", "reports", "scenes")},
+    **{
+        name: name
+        for name in ("errors", "images", "io", "lm", "plots", "reports", "samples", "scenes")
+    },
     "verdicts": "verdicts",
     "gauge": "multi_view.gauge",
 }

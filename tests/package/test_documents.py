@@ -34,7 +34,7 @@ MODULES = {
                 "io",
                 "kernels",
             ),
-            *("plots", "reports", "verdicts"),
+            *("plots", "reports", "samples", "verdicts"),
         )
     },
 }

@@ -32,6 +32,7 @@ COMMANDS = {
     "demo": "demo --trials 1 --no-plot",
     "data": "data",
     "info": "info",
+    "samples": "samples",
 }
 
 

@@ -11,10 +11,11 @@ from typing import Annotated
 import typer
 
 import epigauge as eg
-from epigauge.cli._common import command
+from epigauge.cli._common import command, set_loudness
 from epigauge.cli.bundle import bundle
 from epigauge.cli.colmap import colmap
 from epigauge.cli.compare import compare
+from epigauge.cli.completion import completion
 from epigauge.cli.data import data
 from epigauge.cli.demo import demo
 from epigauge.cli.estimate import estimate
@@ -23,6 +24,7 @@ from epigauge.cli.metric import metric
 from epigauge.cli.pair import pair
 from epigauge.cli.refine import refine
 from epigauge.cli.reproduce import reproduce
+from epigauge.cli.samples import samples
 from epigauge.cli.scene import scene
 
 __all__ = ["app"]
@@ -43,6 +45,13 @@ def _version(asked: bool) -> None:
 
 @app.callback()
 def _main(
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="No text for people but errors.")
+    ] = False,
+    verbose: Annotated[
+        int,
+        typer.Option("--verbose", "-v", count=True, help="Log results; twice: every evaluation."),
+    ] = 0,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
     ] = False,
@@ -51,8 +60,10 @@ def _main(
 
     Text for people goes to stderr, data to stdout.
     Exit codes: 0 done, 1 the result must not be used (it did not converge, or its
-    flags say so), 2 bad input.
+    flags say so), 2 bad input. Files of matches and tracks may be - for stdin.
+    -q and -v may stand anywhere.
     """
+    set_loudness(quiet, verbose)
 
 
 for _function in (
@@ -68,5 +79,7 @@ for _function in (
     data,
     info,
     reproduce,
+    samples,
+    completion,
 ):
     app.command()(command(_function))

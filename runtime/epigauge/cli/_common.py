@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
 import errno
 import functools
+import logging
 import os
+import shutil
 import sys
+import tempfile
 from collections.abc import Callable
 from contextvars import ContextVar
 from pathlib import Path
@@ -29,6 +33,11 @@ DONE, NOT_CONVERGED, BAD_INPUT = 0, 1, 2
 #: What a shell reports of a program that Ctrl-C has ended.
 INTERRUPTED = 130
 
+#: How files begin that are no text.
+_STARTS = {".npz": b"PK", ".npy": b"\x93NUMPY", ".h5": b"\x89HDF"}
+
+#: Whether people are told nothing but errors.
+_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
 #: Name of the command that runs.
 _running: ContextVar[str] = ContextVar("command", default="")
 
@@ -75,7 +84,28 @@ def command(function: Callable[P, int]) -> Callable[P, None]:
 
 def console() -> Console:
     """Return the console for people: on stderr, as it is at this moment."""
-    return Console(stderr=True, highlight=False)
+    return Console(stderr=True, highlight=False, quiet=_quiet.get())
+
+
+def set_loudness(quiet: bool, verbose: int) -> None:
+    """Choose how much people are told: nothing, or also what the solvers log."""
+    _quiet.set(quiet)
+    if verbose:
+        level = logging.INFO if verbose == 1 else logging.DEBUG
+        logging.basicConfig(level=level, format="%(message)s", stream=sys.stderr, force=True)
+
+
+def given(path: Path) -> Path:
+    """Return a file to read: for ``-`` a copy of what stdin holds, kept until the program ends."""
+    if str(path) != "-":
+        return path
+    content = sys.stdin.buffer.read()
+    folder = tempfile.mkdtemp(prefix="epigauge-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    form = next((form for form, start in _STARTS.items() if content.startswith(start)), ".csv")
+    copied = Path(folder, f"stdin{form}")
+    copied.write_bytes(content)
+    return copied
 
 
 def check_target(path: Path, *suffixes: str) -> None:

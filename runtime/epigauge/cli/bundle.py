@@ -34,6 +34,7 @@ from epigauge.cli._common import (
     choice,
     console,
     facts,
+    given,
     named,
     shown,
     write_json,
@@ -171,7 +172,7 @@ def bundle(
     Ctrl-C stops after the evaluation being done: the best estimate so far is
     reported and saved as asked, with exit code 130.
     """
-    plots, outputs = plot or [], output or []
+    plots, outputs, tracks = plot or [], output or [], given(tracks)
     if refine is not None or image_size is not None or is_scene(tracks):
         others = {"gauge": gauge, "start": start, "colmap": colmap, "clean": clean or None}
         asked: dict[str, Any] = {

@@ -20,6 +20,7 @@ from epigauge.cli._common import (
     Json,
     check_target,
     console,
+    given,
     named,
     shown,
     write_json,
@@ -69,6 +70,7 @@ def compare(
     Ctrl-C stops after the evaluation being done: what has been measured so far
     is reported, with exit code 130.
     """
+    tracks = given(tracks)
     if plot is not None:
         check_target(plot, ".png", ".svg")
     out = console()

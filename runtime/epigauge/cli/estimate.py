@@ -11,7 +11,7 @@ import typer
 
 import epigauge as eg
 from epigauge._options import Backend, FrontEnd
-from epigauge.cli._common import Json, check_target, choice
+from epigauge.cli._common import Json, check_target, choice, given
 from epigauge.cli.refine import FROM_FILE, finish, warn_of_marks
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import load_matches
@@ -60,6 +60,7 @@ def estimate(
         check_target(plot, ".png", ".svg")
     if output is not None:
         check_target(output, ".npz", ".json")
+    matches = given(matches)
     pair = load_matches(matches, inliers=inliers)
     warn_of_marks(pair, "which are judged anew")
     begin = time.perf_counter()

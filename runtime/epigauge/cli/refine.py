@@ -22,6 +22,7 @@ from epigauge.cli._common import (
     choice,
     console,
     facts,
+    given,
     shown,
     warn,
     write_json,
@@ -75,6 +76,7 @@ def refine(
         check_target(plot, ".png", ".svg")
     if output is not None:
         check_target(output, ".npz", ".json")
+    matches = given(matches)
     pair = load_matches(matches, inliers=inliers)
     if not inliers:
         warn_of_marks(pair, "which is ignored: --inliers uses only them")
