@@ -116,7 +116,7 @@ def by_pycolmap(tracks: eg.Tracks, scene: eg.MetricReconstruction) -> float:
     for image in model.images:
         config.add_image(image)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjuster = pycolmap.create_default_bundle_adjuster(
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(
         pycolmap.BundleAdjustmentOptions(), config, model
     )
     begun = time.process_time()

@@ -54,6 +54,12 @@ class Sandwich:
         return self._blocks[0]
 
     @property
+    def views(self) -> Array:
+        """The cameras' diagonal blocks, (n, 12, 12)."""
+        n = self.plain.layout.n_views
+        return self.cameras.reshape(n, 12, n, 12)[np.arange(n), :, np.arange(n)]
+
+    @property
     def points(self) -> Array:
         """The points' diagonal blocks, (m, 4, 4)."""
         return self._blocks[1]

@@ -150,7 +150,7 @@ def _null(rows: Array) -> Array:
 class Inverse:
     """X = X_0 + L M L^T, with X_0 that of the images and priors of one view or point.
 
-    All in own tangents: d numbers a camera, three a point. Of the cameras' part of X_0 the blocks
+    All in own tangents: d numbers a camera, b a point. Of the cameras' part of X_0 the blocks
     of views that see common points are stored, all that blocks of single views and points need;
     any other follows from the factor.
 
@@ -158,9 +158,9 @@ class Inverse:
     ----------
     coupling : Coupling
         W.
-    T : ndarray, shape (m, 3, 3)
+    T : ndarray, shape (m, b, b)
         T T^T is the inverse V^-1 of the points' own blocks.
-    V_inverse : ndarray, shape (m, 3, 3)
+    V_inverse : ndarray, shape (m, b, b)
         V^-1.
     reduced : Bordered
         The factor of the cameras' part.
@@ -170,9 +170,9 @@ class Inverse:
         The stored blocks of the cameras' part.
     reference : NumpyLinearizer
         The observations, for W of a point.
-    at : tuple of ndarray, shape (n, c), (m, 3)
+    at : tuple of ndarray, shape (n, c), (m, b)
         The estimate.
-    L_cameras, L_points : ndarray, shape (n, d, q), (m, 3, q)
+    L_cameras, L_points : ndarray, shape (n, d, q), (m, b, q)
         L.
     M : ndarray, shape (q, q)
         M.
@@ -211,10 +211,46 @@ class Inverse:
             Where the observations leave something undetermined beside the gauge.
         """
         motions = Motions.of(system, priors, kernels)
-        open_rays = undetermined(system.V)
+        unit = np.sqrt(motions.weights(system)) * combined(motions.cameras, motions.loose)
+        return Inverse.held(system, reference, motions, unit, motions.lifted(system), priors)
+
+    @staticmethod
+    def held(
+        system: BundleSystem,
+        reference: NumpyLinearizer,
+        motions: Motions,
+        unit: Array,
+        lifted: Array,
+        priors: Priors | None = None,
+    ) -> Inverse:
+        """Invert the normal equations, given what holds the gauge.
+
+        Parameters
+        ----------
+        system : BundleSystem
+            Regular beside the motions.
+        reference : NumpyLinearizer
+            The observations.
+        motions : Motions
+            The gauge freedom.
+        unit : ndarray, shape (n, d, f)
+            What the motions are in the measure of the images.
+        lifted : ndarray, shape (n, d, f)
+            F, of all views.
+        priors : Priors, optional
+            What the system has beside the observations.
+
+        Raises
+        ------
+        ArgumentError
+            Where the observations leave something undetermined beside the gauge.
+        """
+        # Homogeneous points are where they are, infinitely far or not.
+        homogeneous = system.model.homogeneous
+        open_rays = np.zeros(len(system.V), np.bool_) if homogeneous else undetermined(system.V)
         try:
             with np.errstate(over="raise", divide="raise", invalid="raise"):
-                F = _held(system, motions)
+                F = _held(system.normal.coupling, unit, lifted)
                 T, reduced, ties, blocks = _cameras(system, F, open_rays)
         except (np.linalg.LinAlgError, FloatingPointError):
             raise ArgumentError(
@@ -226,7 +262,7 @@ class Inverse:
         n, d = system.normal.g_cameras.shape
         parts = system.normal.coupling, T, T @ np.swapaxes(T, 1, 2), reduced, ties, blocks
         at = system.cameras, system.points
-        none = np.zeros((n, d, 0)), np.zeros((len(T), 3, 0)), np.zeros((0, 0))
+        none = np.zeros((n, d, 0)), np.zeros((*T.shape[:2], 0)), np.zeros((0, 0))
         plain = Inverse(*parts, reference, at, *none, motions, open_rays)
         if not motions.held.size and system.constraints is None:
             return plain
@@ -256,9 +292,9 @@ class Inverse:
         return n, d
 
     def apply(self, cameras: Array, points: Array) -> tuple[Array, Array]:
-        """Return X times columns (n, d, k) and (m, 3, k)."""
+        """Return X times columns (n, d, k) and (m, b, k)."""
         own = self.V_inverse @ points
-        x = self._solved(cameras - self.coupling.to_cameras(None, own))
+        x = self.solved(cameras - self.coupling.to_cameras(None, own))
         y = own - self.V_inverse @ self.coupling.to_points(None, np.ascontiguousarray(x))
         if self.M.size:
             small = self.M @ products((self.L_cameras, self.L_points), (cameras, points))
@@ -272,7 +308,7 @@ class Inverse:
 
     @cached_property
     def W(self) -> Array:
-        """Coupling of each edge, (E, d, 3)."""
+        """Coupling of each edge, (E, d, b)."""
         return self.reference.graph.sum_edges(self.reference.coupling_blocks(*self.at))
 
     @property
@@ -300,7 +336,7 @@ class Inverse:
 
     @cached_property
     def diagonals(self) -> tuple[Array, Array]:
-        """The diagonal blocks of X of cameras (n, d, d) and points (m, 3, 3)."""
+        """The diagonal blocks of X of cameras (n, d, d) and points (m, b, b)."""
         points = self.coupling.marginals(self.T, self.blocks, coupled=False)[0]
         views = spread(self.blocks.diagonal, self.L_cameras, self.M)
         return views, spread(points, self.L_points, self.M)
@@ -312,24 +348,24 @@ class Inverse:
             n, d, _ = self.sizes
             right = np.zeros((n, d, d))
             right[k] = np.eye(d)
-            found = self._solved(right)[i]
+            found = self.solved(right)[i]
         return found
 
     def _cross(self, point: int) -> Array:
-        """Return the blocks of X_0 of all cameras and a point, (n, d, 3)."""
+        """Return the blocks of X_0 of all cameras and a point, (n, d, b)."""
         found = self._crossed.get(point)
         if found is None:
             views, Y = self._factors(point)
             right = np.zeros((*self.sizes[:2], Y.shape[2]))
             right[views] = Y
-            found = -self._solved(right)
+            found = -self.solved(right)
             if len(self._crossed) >= _CROSSED:
                 self._crossed.clear()
             self._crossed[point] = found
         return found
 
     def _points(self, i: int, j: int) -> Array:
-        """Return the block of X_0 of two points, (3, 3)."""
+        """Return the block of X_0 of two points, (b, b)."""
         views, Y = self._factors(j)
         found = -np.einsum("ndi,ndj->ij", self._cross(i)[views], Y)
         return np.asarray(found + (self.V_inverse[i] if i == j else 0.0))
@@ -339,34 +375,32 @@ class Inverse:
         return {}
 
     def _factors(self, point: int) -> tuple[Indices, Array]:
-        """Return the views of a point, and W V^-1 of these edges, (k, d, 3)."""
+        """Return the views of a point, and W V^-1 of these edges, (k, d, b)."""
         views, W = self.reference.coupling_of(*self.at, point)
         return views, W @ self.V_inverse[point]
 
-    def _solved(self, own: Array) -> Array:
+    def solved(self, own: Array) -> Array:
         """Return the cameras' part of X_0 times columns (n, d, k)."""
         return self.ties.cameras(*self.reduced.solve(self.ties.local(own), self.ties.shared(own)))
 
 
-def _held(system: BundleSystem, motions: Motions) -> Array:
-    """Return F (n, d, f): lifted motions, but of some views only, that hold the whole gauge.
+def _held(coupling: Coupling, unit: Array, lifted: Array) -> Array:
+    """Return F (n, d, f), of some views only that hold the whole gauge.
 
     F F^T couples these views with one another. All of them share points, so that the reduced
     system keeps its blocks; of such sets that is taken whose views hold the gauge most firmly.
     """
-    F = motions.lifted(system)
-    if not F.shape[2]:
-        return F
-    unit = np.sqrt(motions.weights(system)) * (motions.cameras @ motions.loose)
-    unit /= np.sqrt(np.sum(unit**2, axis=(0, 1)))
-    sets = system.normal.coupling.cliques()
+    if not unit.shape[2]:
+        return lifted
+    unit = unit / np.sqrt(np.sum(unit**2, axis=(0, 1)))
+    sets = coupling.cliques()
     grams = np.tensordot(sets.astype(float), np.swapaxes(unit, 1, 2) @ unit, 1)
     firmest = sets[int(np.argmax(np.linalg.eigvalsh(grams)[:, 0]))]
-    return np.where(firmest[:, None, None], F, 0.0)
+    return np.where(firmest[:, None, None], lifted, 0.0)
 
 
 def added_by_priors(system: BundleSystem, priors: Priors | None) -> tuple[Array, Array]:
-    """Return what priors of one view or point add to J^T J, (n, d, d) and (m, 3, 3)."""
+    """Return what priors of one view or point add to J^T J, (n, d, d) and (m, b, b)."""
     if priors is None:
         return np.zeros_like(system.normal.U), np.zeros_like(system.normal.V)
     zero = {name: np.zeros_like(getattr(system.normal, name)) for name in _SUMS}
@@ -408,7 +442,7 @@ def _cameras(
 
 
 def _sized(V: Array) -> Array:
-    """Return unit matrices as large as blocks (m, 3, 3)."""
+    """Return unit matrices as large as blocks (m, b, b)."""
     trace = np.einsum("mii->m", V) / V.shape[1]
     return np.asarray(trace[:, None, None] * np.eye(V.shape[1]))
 
