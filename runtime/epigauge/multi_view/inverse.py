@@ -75,8 +75,8 @@ class Inverse:
         n, a = p.shape
         unit, y = G[: n * a].reshape(n, a, -1), G[n * a :].reshape(len(q), q.shape[1], -1)
         free = unit.shape[2]
-        moves = [np.asarray(np.linalg.solve(*pair)) for pair in ((cameras, unit), (points, y))]
-        motions = Motions(*moves, np.eye(free), np.zeros((free, 0)))
+        x, y = (np.asarray(np.linalg.solve(*pair)) for pair in ((cameras, unit), (points, y)))
+        motions = Motions(x, y, np.eye(free), np.zeros((free, 0)))
         system = BundleSystem(
             grounded,
             inverse_roots,
