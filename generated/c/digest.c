@@ -7,7 +7,7 @@
 
 const char *eg_digest(void)
 {
-    return "52b42df11d37798f";
+    return "4e0a25f62cb837a8";
 }
 
 const char *eg_sources(void)

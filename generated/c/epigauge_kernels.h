@@ -1145,6 +1145,14 @@ EG_EXPORT void eg_maps(
     double *EG_RESTRICT P2,
     double *EG_RESTRICT dP2);
 
+EG_EXPORT void eg_seven_points(
+    ptrdiff_t n,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    double *EG_RESTRICT F,
+    double *EG_RESTRICT votes,
+    double *EG_RESTRICT discriminant);
+
 EG_EXPORT void eg_pseudo_object_space(
     ptrdiff_t n,
     const double *EG_RESTRICT eta_array,

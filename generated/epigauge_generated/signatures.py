@@ -971,6 +971,12 @@ SIGNATURES = {
         (Argument("F", (3, 3), True), Argument("dF", (9, 7), True), Argument("d2F", (9, 7, 7), True), Argument("P2", (3, 4), True), Argument("dP2", (12, 7), True), ),
         "F and P' = ([e']_x F | e') by the epipoles (x, y, 1), (x', y', 1) and the epipolar transformation (1, b; c, d) (MAPS, B&S section 2).",
     ),
+    "seven_points": Signature(
+        "minimal",
+        (Argument("q1", (2, 7), True), Argument("q2", (2, 7), True), ),
+        (Argument("F", (3, 3, 3), True), Argument("votes", (3,), True), Argument("discriminant", (), True), ),
+        "F of seven matches (R. Hartley, A. Zisserman, Multiple View Geometry, 2003, 11.1.2): the roots of det(F1 + a F2) = 0, the first always real, the others where the discriminant is positive. Votes are 7 or -7 where all matches have one sign of (e' x q') . (F q), the oriented epipolar constraint.",
+    ),
     "pseudo_object_space": Signature(
         "object_space",
         (Argument("eta", (), False), Argument("P", (3, 4), True), Argument("X", (3,), True), Argument("q", (2,), True), ),

@@ -20,6 +20,7 @@ EG_EXPORT ptrdiff_t eg_shared_size(const char *name)
         {"eg_options", sizeof(eg_options)},
         {"eg_outcome", sizeof(eg_outcome)},
         {"eg_quick_options", sizeof(eg_quick_options)},
+        {"eg_search_options", sizeof(eg_search_options)},
     };
     for (size_t k = 0; k < sizeof shared / sizeof shared[0]; ++k)
         if (!strcmp(shared[k].name, name))

@@ -5,6 +5,8 @@
 #ifndef EPIGAUGE_TWO_VIEW_H
 #define EPIGAUGE_TWO_VIEW_H
 
+#include <stdint.h>
+
 #include "losses.h"
 
 /* Matches are kept and worked on in blocks, so that all between two passes stays in the cache. */
@@ -95,5 +97,15 @@ typedef struct {
     ptrdiff_t samples, pool; /* threes of matches, and how many they are judged by */
     ptrdiff_t pairs, rank;   /* wrong pairs, and how many must be near */
 } eg_quick_options;
+
+/* How to search among raw matches, as in the structure of search.py. */
+typedef struct {
+    uint64_t seed;
+    ptrdiff_t samples, least;      /* of seven matches, at most and at least */
+    int planes, pairs;             /* threes that give a plane, and twos off it */
+    int steps, widths;             /* of the local optimisation */
+    double scale, floor2;          /* of distances, and a part of its square that is rounding */
+    double patience, width[4];     /* more samples than one is good; widths in scales */
+} eg_search_options;
 
 #endif

@@ -28,6 +28,7 @@ __all__ = [
     "as_matches",
     "as_positive",
     "as_real",
+    "as_score",
     "as_weights",
     "check_general_position",
 ]
@@ -341,6 +342,35 @@ def as_weights(weights: ArrayLike, m: int) -> Array:
     if m and not w.any():
         raise ArgumentError("weights", "is zero for every match", "some positive weights")
     return np.ascontiguousarray(w)
+
+
+def as_score(score: ArrayLike, m: int) -> Array:
+    """Check how promising each match is: finite numbers, the highest first.
+
+    Parameters
+    ----------
+    score : array_like, shape (m,)
+        One number a match.
+    m : int
+        Number of matches.
+
+    Returns
+    -------
+    ndarray, shape (m,), float64
+        The numbers.
+
+    Raises
+    ------
+    ArgumentError
+        On another shape or type, NaN or infinity (the first is named).
+    """
+    values = as_real("score", score, f"an ({m},) array")
+    if values.shape != (m,):
+        raise ArgumentError("score", f"has shape {values.shape}", f"({m},): one number a match")
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        raise ArgumentError("score", f"holds {values[bad[0]]} at {bad[0]}", "finite numbers")
+    return as_double(values)
 
 
 def as_covariances(name: str, value: ArrayLike, m: int) -> Array:

@@ -47,7 +47,7 @@ Structure = Literal["eliminated", "joint"]
 PairDamping = Literal["levenberg", "seber"]
 Hessian = Literal["exact", "gauss-newton"]
 Part = Literal["epipole1", "epipole2", "epipolar_transformation"]
-FrontEnd = Literal["auto", "poselib", "opencv"]
+FrontEnd = Literal["auto", "native", "poselib", "opencv"]
 
 Method = Literal[
     "covariant",

@@ -225,24 +225,27 @@ def test_measured_pairs_agree_with_what_their_makers_call_right(pair):
     assert result.status > 0
     # Where all right matches bear the label of one plane, the makers call the scene flat.
     assert result.success or (len(planes) == 1 and result.flags == ("planar scene",))
-    # They drop duplicates and took another threshold, for the whole image or per plane.
-    assert np.mean(result.inlier[inlier]) > 0.75
+    # They drop duplicates and took another threshold, for the whole image or per plane. In the
+    # smallest sets, several geometries have about the same support.
+    assert np.mean(result.inlier[inlier]) > 0.7
 
 
-def test_without_a_front_end_the_message_names_the_remedy(monkeypatch):
+@pytest.mark.parametrize("name", ["poselib", "opencv"])
+def test_without_a_front_end_the_message_names_the_remedy(monkeypatch, name):
     _, x1, x2, _ = spoilt(0)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingPackageError, match=r"pip install 'epigauge\[cv\]'"):
-        eg.estimate_fundamental(x1, x2)
+        eg.estimate_fundamental(x1, x2, robust=name)
+    assert eg.estimate_fundamental(x1, x2).success
 
 
 @front_end
 def test_front_end_that_finds_nothing_is_replaced(monkeypatch):
-    from epigauge.two_view import robust
+    from epigauge.two_view import front_ends
 
-    monkeypatch.setattr(robust, "_FRONT_ENDS", {INSTALLED[0]: lambda *arguments: None})
+    monkeypatch.setattr(front_ends, "_FRONT_ENDS", {INSTALLED[0]: lambda *arguments: None})
     scene, x1, x2, _ = spoilt(20)
-    result = eg.estimate_fundamental(x1, x2)
+    result = eg.estimate_fundamental(x1, x2, robust=INSTALLED[0])
     assert result.start == "8point"
     assert error(result.F, scene) < 0.5
 

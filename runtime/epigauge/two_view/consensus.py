@@ -79,6 +79,8 @@ class Agreement:
         Share of right matches.
     score : float
         Logarithm of the likelihood, less what any seven matches gain by fitting exactly.
+    extent : float
+        Largest distance that counts: wrong matches are uniform up to it.
     """
 
     F: Array
@@ -87,11 +89,12 @@ class Agreement:
     sigma: float
     share: float
     score: float
+    extent: float = RANGE
 
     @property
     def mixture(self) -> Mixture:
         """Return the density of the distances."""
-        return Mixture.of(self.sigma, self.share, RANGE)
+        return Mixture.of(self.sigma, self.share, self.extent)
 
     def inliers(self, limit: float) -> Mask:
         """Return which matches are oriented and within a distance."""
@@ -123,26 +126,31 @@ class Consensus:
         self.few = slice(None, None, -(-q1.shape[1] // _FEW))
         self.products = (self.h2[:, None, self.few] * self.h1[None, :, self.few]).reshape(9, -1)
 
-    def judge(self, F: Array, sigma: float, share: float = 0.5) -> Agreement:
-        """Return the agreement with F, sigma and share being fitted from the values given."""
+    def judge(self, F: Array, sigma: float, share: float = 0.5, extent: float = RANGE) -> Agreement:
+        """Return the agreement with F, sigma and share being fitted from the values given.
+
+        Scores are to be compared for one extent only. A small one sees no more of the wrong matches
+        than how dense they are beside the epipolar lines.
+        """
         signed = self.criterion.evaluate(F).signed
         # A match without a distance (beside a degenerate F) agrees with nothing.
         there = np.abs(signed) < 1.0 / _FLOOR
         oriented = self.oriented(F) & there
-        squared = np.where(there, signed, 0.0) ** 2
+        near = np.abs(signed) <= extent if extent < RANGE else np.ones(len(signed), np.bool_)
+        squared, counts = np.where(there, signed, 0.0)[near] ** 2, oriented[near]
         best = None
         while True:
-            mixture = Mixture.of(sigma, share, RANGE)
-            wrong = np.log((1.0 - share) / RANGE)
-            logs = np.where(oriented, mixture.logarithm(squared), wrong)
-            score = float(np.sum(logs)) - 7.0 * float(np.log(RANGE / sigma))
+            mixture = Mixture.of(sigma, share, extent)
+            wrong = np.log((1.0 - share) / extent)
+            logs = np.where(counts, mixture.logarithm(squared), wrong)
+            score = float(np.sum(logs)) - 7.0 * float(np.log(extent / sigma))
             # An F that has no distances (NaN) climbs no further.
             if best is not None and not score > best.score + _CLIMBED:
                 return best
-            best = Agreement(F, signed, oriented, sigma, share, score)
-            right = np.where(oriented, mixture(squared)[1], 0.0)
+            best = Agreement(F, signed, oriented, sigma, share, score, extent)
+            right = np.where(counts, mixture(squared)[1], 0.0)
             count = float(np.sum(right))
-            share = float(np.clip(count / len(squared), *_SHARES))
+            share = float(np.clip(count / max(len(squared), 1), *_SHARES))
             # The seven parameters of F absorb seven squares of the noise
             variance = np.sum(right * squared) / max(count - 7.0, 1.0)
             sigma = min(max(float(np.sqrt(variance)), _FLOOR), self.widest)

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
 from types import SimpleNamespace
 from typing import Any, ClassVar, Literal, Unpack
 
@@ -15,17 +11,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
-from epigauge._arguments import as_choice, as_count, as_matches, as_positive
+from epigauge._arguments import as_count, as_matches, as_positive, as_score
 from epigauge._logged import logged
 from epigauge._options import FrontEnd, RefineOptions, known_options
-from epigauge.errors import ArgumentError, MissingPackageError
+from epigauge.errors import ArgumentError
 from epigauge.two_view.chance import CEILING
-from epigauge.two_view.conditioning import RMS, condition
+from epigauge.two_view.conditioning import condition
 from epigauge.two_view.consensus import RANGE, Agreement, Consensus
 from epigauge.two_view.copies import earliest
 from epigauge.two_view.covariance import untruncated
 from epigauge.two_view.essential_consensus import EssentialConsensus
-from epigauge.two_view.initial import fundamental_8point
+from epigauge.two_view.front_ends import checked, start
 from epigauge.two_view.losses import robust_scale
 from epigauge.two_view.refine import calibrations, refine_fundamental
 from epigauge.two_view.result import FundamentalResult
@@ -35,22 +31,10 @@ __all__ = ["RobustResult", "estimate_fundamental"]
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: Front ends work in coordinates of this RMS, as an image has: OpenCV computes in float32.
-_PIXELS = 250.0 / RMS
-
-#: Thresholds that front ends are run with where none is given, in conditioned coordinates whose
-#: range is about 7: from a twentieth of a per cent of the image to 3 %.
-_THRESHOLDS = (0.0035, 0.02, 0.2)
-
 #: Distance of an inlier in standard deviations of the noise, at most.
 _DEVIATIONS = 3.0
 
 _ROUNDS = 20
-
-#: Iterations of the front ends: more where the first find fewer right matches than this. With half
-#: of them right, one sample of seven in 128 is clean.
-_ITERATIONS = (1_000, 10_000)
-_MOST_RIGHT = 0.5
 
 #: Options of `refine_fundamental` with one entry a match.
 _PER_MATCH = {"weights": 1, "covariance1": 3, "covariance2": 3}
@@ -73,8 +57,8 @@ class RobustResult(FundamentalResult):
     rounds : int
         How many times F was refined before the inliers stood still.
     start : str
-        Front end whose start agreed best with the matches: "poselib", "opencv", or "8point" where
-        it found nothing.
+        Front end that gave the start: "native", "poselib", "opencv", or "8point" where it found
+        nothing.
     """
 
     _shown: ClassVar[tuple[str, ...]] = (
@@ -105,13 +89,14 @@ def estimate_fundamental(
     *,
     robust: FrontEnd = "auto",
     threshold_px: float | Literal["auto"] = "auto",
+    score: ArrayLike | None = None,
     seed: int = 0,
     **options: Unpack[RefineOptions],
 ) -> RobustResult:
     """Find the fundamental matrix of raw matches, gross errors among them.
 
-    A front end (PoseLib or OpenCV) gives starts. From there the likelihood of all matches is
-    maximised over F, the noise and the share of right matches. `refine_fundamental` then fits
+    Samples of seven matches give starts, of which the best by all matches is improved [1]_. The
+    noise and the share of right matches follow from its distances. `refine_fundamental` then fits
     the inliers, those whose exact distance is within a threshold, until they stand still.
 
     Parameters
@@ -119,13 +104,16 @@ def estimate_fundamental(
     x1, x2 : array_like, shape (m, 2)
         At least eight different matches in pixels, five with ``essential=True``; exact duplicates
         count once.
-    robust : {"auto", "poselib", "opencv"}
-        The front end: PoseLib's LO-RANSAC or OpenCV's USAC_MAGSAC. "auto" starts from both, where
-        both are installed.
+    robust : {"auto", "native", "poselib", "opencv"}
+        The front end: the search of this package (also "auto"), or to compare with, PoseLib's
+        LO-RANSAC or OpenCV's USAC_MAGSAC.
     threshold_px : float or "auto"
         Largest distance of an inlier. "auto" takes three standard deviations of the noise, from the
         median distance of the inliers, but no more than the distance at which a match is as likely
         right as wrong.
+    score : array_like, shape (m,), optional
+        How promising each match is, the highest first: more samples are drawn from these. By
+        default, matches are ranked by whether their neighbours move alike.
     seed : int
         Of everything random: one seed, one answer.
     **options
@@ -141,19 +129,38 @@ def estimate_fundamental(
     Raises
     ------
     MissingPackageError
-        If the front end, or with "auto" any, is not installed.
+        If the package of the front end is not installed.
     ArgumentError
         On bad arguments.
 
     Notes
     -----
-    The density of the distance d of a match is taken as p N(d; 0, sigma^2) + (1 - p) / range; the
-    range is that of the coordinates. The likelihood is climbed from the start and from 8-point
-    estimates of random subsets of the inliers, until that finds nothing higher. Matches that
-    violate the oriented epipolar constraint count as wrong.
+    The density of the distance d of a match is taken as p N(d; 0, sigma^2) + (1 - p) / range. Where
+    many matches agree within the noise of good detectors, the range is a small one around it:
+    wrong matches of repeated structure are dense beside the epipolar lines. Elsewhere it is that of
+    the coordinates, and the likelihood is climbed from what the search found at several noises and
+    from 8-point estimates of random subsets of the inliers, until that finds nothing higher.
+    Matches that violate the oriented epipolar constraint count as wrong.
+
+    References
+    ----------
+    .. [1] D. Barath, J. Noskova, M. Ivashechkin, J. Matas, "MAGSAC++, a fast, reliable and accurate
+       robust estimator", CVPR 2020; O. Chum, T. Werner, J. Matas, "Two-view geometry estimation
+       unaffected by a dominant plane", CVPR 2005.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import epigauge as eg
+    >>> scene = eg.two_view_scene(n_points=300, noise_px=0.1)
+    >>> x1, x2 = scene.x1.copy(), scene.x2.copy()
+    >>> x2[::3] = x2[::3][::-1]  # every third match is wrong
+    >>> result = eg.estimate_fundamental(x1, x2)
+    >>> bool(result.success), round(float(np.mean(result.inlier[::3])), 1)
+    (True, 0.0)
     """
     known = known_options("estimate_fundamental", options, RefineOptions, ("F0",))
-    return _estimated(x1, x2, robust, threshold_px, seed, known)
+    return _estimated(x1, x2, robust, threshold_px, score, seed, known)
 
 
 def _estimated(
@@ -161,6 +168,7 @@ def _estimated(
     x2: ArrayLike,
     robust: str,
     threshold_px: float | str,
+    score: ArrayLike | None,
     seed: int,
     options: dict[str, Any],
 ) -> RobustResult:
@@ -170,29 +178,31 @@ def _estimated(
     )
     least = 8 if calibration is None else 5
     x1, x2 = as_matches(x1, x2, at_least=least, general_position=True)
-    names = _front_ends(robust)
+    front_end = checked(robust)
     seed = as_count("seed", seed, at_least=0)
     threshold = None if threshold_px == "auto" else as_positive("threshold_px", threshold_px)
     if "F0" in options:
         raise ArgumentError("F0", "is given", "refine_fundamental, which starts from it")
+
+    promise = None if score is None else as_score(score, len(x1))
 
     first = earliest(x1, x2)
     rows = np.flatnonzero(first == np.arange(len(x1)))
     if len(rows) < 8:
         raise ArgumentError("x1, x2", f"hold {len(rows)} different matches", "at least 8")
     copies = np.searchsorted(rows, first)
+    promise = promise if promise is None else promise[rows]
     y1, y2 = x1[rows], x2[rows]
 
     frame = condition(y1, y2)
     table, q = kernels.table(options.get("backend")), frame.forward(y1, y2)
     consensus = Consensus(table, *q)
+    given = None if threshold is None else threshold / frame.scale
+    name, agreement = start(consensus, table, front_end, given, promise, seed)
     if calibration is not None:
         maps = zip(frame.maps_from_pixels(), calibration, strict=True)
         consensus = EssentialConsensus(table, *q, *(to_units @ K for to_units, K in maps))
-    thresholds = _THRESHOLDS if threshold is None else (threshold / frame.scale,)
-    starts = _starts(consensus, names, thresholds, seed)
-    name = max(starts, key=lambda start: start[1].score)[0]
-    agreement = consensus.search((a for _, a in starts), np.random.default_rng(seed))
+        agreement = consensus.search([agreement], np.random.default_rng(seed))
 
     options.setdefault("noise_px", None)
     limit = threshold / frame.scale if threshold is not None else _at_most(agreement.mixture.even)
@@ -201,11 +211,11 @@ def _estimated(
     while inlier.tobytes() not in fitted and len(fitted) < _ROUNDS:
         fitted.add(inlier.tobytes())
         used, limit_px = inlier, limit * frame.scale
-        start = frame.to_pixels(agreement.F)
         chosen = _of_matches(options, len(x1), rows[used])
-        refined = refine_fundamental(y1[used], y2[used], start, **chosen)
+        F0 = frame.to_pixels(agreement.F)
+        refined = refine_fundamental(y1[used], y2[used], F0, **chosen)
         F = frame.from_pixels(refined.F)
-        agreement = consensus.judge(F, agreement.sigma, agreement.share)
+        agreement = consensus.judge(F, agreement.sigma, agreement.share, agreement.extent)
         if threshold is None:
             sigma = robust_scale(agreement.signed[used])
             limit = min(limit, max(_DEVIATIONS * sigma, 1e-9))
@@ -230,14 +240,18 @@ def _estimated(
         "rounds": len(fitted),
         "start": name,
     }
-    if threshold is None:  # real noise has heavier tails than three deviations of its core
-        limit = max(limit, _at_most(agreement.mixture.even))
     weights = _of_matches(options, len(x1), rows).get("weights")
     raw = _Raw(y1, y2, np.ones(len(y1)) if weights is None else np.asarray(weights, float))
-    agreeing = agreement.inliers(limit)  # where fewer than 8, "no common geometry"
-    return RobustResult.partial(
-        known, partial(_judged, refined, raw, agreeing, limit * frame.scale)
-    )
+
+    def judged() -> SimpleNamespace:
+        agreed, bound = agreement, limit
+        if threshold is None:  # real noise has heavier tails than three deviations of its core
+            agreed = consensus.judge(agreement.F, agreement.sigma, agreement.share)
+            bound = max(limit, _at_most(agreed.mixture.even))
+        agreeing = agreed.inliers(bound)  # where fewer than 8, "no common geometry"
+        return _judged(refined, raw, agreeing, bound * frame.scale)
+
+    return RobustResult.partial(known, judged)
 
 
 @dataclass(frozen=True)
@@ -278,68 +292,3 @@ def _of_matches(options: dict[str, Any], m: int, rows: NDArray[np.intp]) -> dict
         if value.ndim == dimensions and len(value) == m:
             chosen[name] = value[rows]
     return chosen
-
-
-def _starts(
-    consensus: Consensus, names: Iterable[str], thresholds: Iterable[float], seed: int
-) -> list[tuple[str, Agreement]]:
-    """Return what the front ends find, run at all thresholds."""
-    few = consensus.few
-    x1, x2 = (np.ascontiguousarray(h[:2, few].T) * _PIXELS for h in (consensus.h1, consensus.h2))
-    back = np.diag([_PIXELS, _PIXELS, 1.0])
-    found: list[tuple[str, Agreement]] = []
-    for iterations in _ITERATIONS:
-        for name, threshold in itertools.product(names, thresholds):
-            F = _FRONT_ENDS[name](x1, x2, threshold * _PIXELS, seed, iterations)
-            if F is not None and np.isfinite(F).all() and np.linalg.matrix_rank(F) >= 2:
-                found.append((name, consensus.judge(back @ F @ back, threshold / _DEVIATIONS)))
-        if found and max(found, key=lambda start: start[1].score)[1].share > _MOST_RIGHT:
-            break
-    if not found:
-        F = back @ fundamental_8point(x1, x2) @ back
-        found.append(("8point", consensus.judge(F, max(thresholds) / _DEVIATIONS)))
-    return found
-
-
-def _front_ends(robust: str) -> tuple[str, ...]:
-    """Return the names of the front ends to use."""
-    as_choice("robust", robust, ("auto", *_FRONT_ENDS))
-    names = tuple(_FRONT_ENDS) if robust == "auto" else (robust,)
-    installed = tuple(n for n in names if importlib.util.find_spec(_MODULES[n]) is not None)
-    if not installed:
-        raise MissingPackageError(" or ".join(_PACKAGES[name] for name in names), "cv")
-    return installed
-
-
-def _poselib(x1: Array, x2: Array, threshold: float, seed: int, iterations: int) -> Array | None:
-    poselib = importlib.import_module("poselib")
-    options = {"max_epipolar_error": threshold, "seed": seed, "max_iterations": iterations}
-    F, _ = poselib.estimate_fundamental(x1, x2, options, {})
-    return np.asarray(F, dtype=np.float64)
-
-
-def _opencv(x1: Array, x2: Array, threshold: float, seed: int, iterations: int) -> Array | None:
-    cv2 = importlib.import_module("cv2")
-    parameters = cv2.UsacParams()
-    parameters.threshold = threshold
-    parameters.confidence = 0.999
-    parameters.maxIterations = iterations
-    parameters.randomGeneratorState = seed
-    parameters.sampler = cv2.SAMPLING_UNIFORM
-    parameters.score = cv2.SCORE_METHOD_MAGSAC
-    parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA
-    parameters.loIterations = 10
-    parameters.final_polisher = cv2.MAGSAC
-    try:
-        F, _ = cv2.findFundamentalMat(x1, x2, parameters)
-    except cv2.error:
-        return None
-    return None if F is None or F.shape != (3, 3) else np.asarray(F, dtype=np.float64)
-
-
-_MODULES = {"poselib": "poselib", "opencv": "cv2"}
-_PACKAGES = {"poselib": "poselib", "opencv": "opencv-python-headless"}
-_FRONT_ENDS: dict[str, Callable[[Array, Array, float, int, int], Array | None]] = {
-    "poselib": _poselib,
-    "opencv": _opencv,
-}

@@ -1,0 +1,204 @@
+"""Geometries of raw matches to begin from: the search of this package, PoseLib's and OpenCV's."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge._arguments import as_choice
+from epigauge.errors import MissingPackageError
+from epigauge.kernels import Table
+from epigauge.two_view.chance import SIGNIFICANT, chance_agreement, log10_false_alarms
+from epigauge.two_view.conditioning import RMS
+from epigauge.two_view.consensus import Agreement, Consensus
+from epigauge.two_view.initial import fundamental_8point
+from epigauge.two_view.search import SCALES, ranked, search
+
+__all__ = ["checked", "start"]
+
+Array = NDArray[np.float64]
+
+#: Other packages work in coordinates of this RMS, as an image has: OpenCV computes in float32.
+_PIXELS = 250.0 / RMS
+
+#: Thresholds that they are run with where none is given, in conditioned coordinates whose range is
+#: about 7: from a twentieth of a per cent of the image to 3 %.
+_THRESHOLDS = (0.0035, 0.02, 0.2)
+
+#: Standard deviations of the noise in a threshold.
+_DEVIATIONS = 3.0
+
+#: The noise is found where so many of the matches within four times its limit are within it.
+_SHARP = 0.5
+
+#: Among fewer matches, some agree so sharply by chance; each search is then made twice.
+_MANY = 400
+
+#: Then wrong matches are looked at within so many scales, for how dense they are there.
+_EXTENT = 20.0
+
+#: Right matches that are more than those which fit by chance.
+_ENOUGH = 14
+
+#: Standard deviation of the noise that the 8-point estimate is judged with.
+_BLIND = 0.07
+
+#: Their iterations: more where the first find fewer right matches than this. With half of them
+#: right, one sample of seven in 128 is clean.
+_ITERATIONS = (1_000, 10_000)
+_MOST_RIGHT = 0.5
+
+
+def checked(robust: str) -> str:
+    """Return the name of a front end that can be used."""
+    name = as_choice("robust", robust, ("auto", "native", *_PACKAGES))
+    if name in _PACKAGES and importlib.util.find_spec(_MODULES[name]) is None:
+        raise MissingPackageError(_PACKAGES[name], "cv")
+    return "native" if name == "auto" else name
+
+
+def start(
+    consensus: Consensus,
+    kernels: Table,
+    robust: str,
+    threshold: float | None,
+    score: Array | None,
+    seed: int,
+) -> tuple[str, Agreement]:
+    """Return the geometry to begin from, with the name of what found it.
+
+    Parameters
+    ----------
+    consensus : Consensus
+        The matches.
+    kernels : Table
+        Backend.
+    robust : {"native", "poselib", "opencv"}
+        The front end.
+    threshold : float or None
+        Largest distance of an inlier, conditioned.
+    score : ndarray, shape (m,), or None
+        How promising each match is.
+    seed : int
+        Of everything random.
+
+    Returns
+    -------
+    tuple of str, Agreement
+        That of the 8-point estimate where nothing else was found.
+    """
+    rng = np.random.default_rng(seed)
+    if robust == "native":
+        best = _native(consensus, kernels, score, seed, rng)
+    else:
+        thresholds = _THRESHOLDS if threshold is None else (threshold,)
+        found = _of_package(consensus, robust, thresholds, seed)
+        best = consensus.search(found, rng) if found else None
+    if best is not None:
+        return robust, best
+    few = consensus.few
+    F = fundamental_8point(consensus.h1[:2, few].T, consensus.h2[:2, few].T)
+    return "8point", consensus.search([consensus.judge(F, _BLIND)], rng)
+
+
+def _native(
+    consensus: Consensus,
+    kernels: Table,
+    score: Array | None,
+    seed: int,
+    rng: np.random.Generator,
+) -> Agreement | None:
+    """Search at the noise of good detectors, and at more of it where that may not be the noise."""
+    few = consensus.few
+    q1, q2 = (np.ascontiguousarray(h[:2, few]) for h in (consensus.h1, consensus.h2))
+    order = ranked(kernels, q1, q2) if score is None else np.argsort(-score[few], kind="stable")
+    agreements: list[Agreement] = []
+    twice = 1 if q1.shape[1] >= _MANY else 2
+    for scale, turn in itertools.product(SCALES, range(twice)):
+        found = search(kernels, q1, q2, order, seed=seed + turn, scale=scale)
+        if not found.score > 0.0:
+            continue
+        own = consensus.judge(found.F, scale)
+        sharp = consensus.judge(found.F, scale, extent=_EXTENT * scale)
+        if sharp.sigma <= 2.0 * scale and _is_sharp(
+            kernels, q1, q2, sharp, np.abs(own.signed[few]), _DEVIATIONS * scale
+        ):
+            return sharp
+        agreements.append(own)
+    if not agreements:
+        return None
+    # A few matches fit exactly by chance: of so many samples, and in any of them seven do.
+    enough = [a for a in agreements if a.share * len(a.signed) >= _ENOUGH] or agreements[-1:]
+    return consensus.search(enough, rng)
+
+
+def _is_sharp(
+    kernels: Table, q1: Array, q2: Array, found: Agreement, d: Array, limit: float
+) -> bool:
+    """Tell whether distances end within a limit, and that many do so is no accident."""
+    # Seven matches may be within any limit
+    core, hits, around = (
+        np.count_nonzero(d <= bound) - 7
+        for bound in (max(_DEVIATIONS * found.sigma, 1e-9), limit, 4.0 * limit)
+    )
+    if len(d) < _MANY or hits <= _SHARP * around or core <= 0.5 * hits:
+        return False
+    chance = chance_agreement(kernels, found.F, q1, q2, limit)
+    return log10_false_alarms(q1.shape[1], int(hits) + 7, chance) <= SIGNIFICANT
+
+
+def _of_package(
+    consensus: Consensus, robust: str, thresholds: tuple[float, ...], seed: int
+) -> list[Agreement]:
+    """Return what another package finds, run at all thresholds."""
+    few = consensus.few
+    x1, x2 = (np.ascontiguousarray(h[:2, few].T) * _PIXELS for h in (consensus.h1, consensus.h2))
+    back = np.diag([_PIXELS, _PIXELS, 1.0])
+    found: list[Agreement] = []
+    for iterations in _ITERATIONS:
+        for threshold in thresholds:
+            F = _FRONT_ENDS[robust](x1, x2, threshold * _PIXELS, seed, iterations)
+            if F is not None and np.isfinite(F).all() and np.linalg.matrix_rank(F) >= 2:
+                found.append(consensus.judge(back @ F @ back, threshold / _DEVIATIONS))
+        if found and max(found, key=lambda a: a.score).share > _MOST_RIGHT:
+            break
+    return found
+
+
+def _poselib(x1: Array, x2: Array, threshold: float, seed: int, iterations: int) -> Array | None:
+    poselib = importlib.import_module("poselib")
+    options = {"max_epipolar_error": threshold, "seed": seed, "max_iterations": iterations}
+    F, _ = poselib.estimate_fundamental(x1, x2, options, {})
+    return np.asarray(F, dtype=np.float64)
+
+
+def _opencv(x1: Array, x2: Array, threshold: float, seed: int, iterations: int) -> Array | None:
+    cv2 = importlib.import_module("cv2")
+    parameters = cv2.UsacParams()
+    parameters.threshold = threshold
+    parameters.confidence = 0.999
+    parameters.maxIterations = iterations
+    parameters.randomGeneratorState = seed
+    parameters.sampler = cv2.SAMPLING_UNIFORM
+    parameters.score = cv2.SCORE_METHOD_MAGSAC
+    parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA
+    parameters.loIterations = 10
+    parameters.final_polisher = cv2.MAGSAC
+    try:
+        F, _ = cv2.findFundamentalMat(x1, x2, parameters)
+    except cv2.error:
+        return None
+    return None if F is None or F.shape != (3, 3) else np.asarray(F, dtype=np.float64)
+
+
+_MODULES = {"poselib": "poselib", "opencv": "cv2"}
+_PACKAGES = {"poselib": "poselib", "opencv": "opencv-python-headless"}
+_FRONT_ENDS: dict[str, Callable[[Array, Array, float, int, int], Array | None]] = {
+    "poselib": _poselib,
+    "opencv": _opencv,
+}

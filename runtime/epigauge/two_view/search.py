@@ -1,0 +1,360 @@
+"""The epipolar geometry that raw matches agree on, from samples of seven matches.
+
+Seven matches give one to three F in closed form; F that put some of the seven behind a camera are
+dropped. An F is judged by all matches:
+
+    sum log(1 + c^2 / (d^2 + f^2)),
+
+with the distance d to first order, a scale c near the noise of good detectors, and f = c / 10 for
+rounding. This is a mixture of all noises, those above c having less and less weight: neither the
+noise nor a threshold need be known, and wrong matches that lie near the epipolar lines, as those of
+repeated windows do, count little against a sharp agreement. The best F of a batch of samples is
+improved by robust fits to the matches around. If most of the matches that agree then lie on one
+plane, F through its homography and two matches off it are tried [1]_.
+
+Right matches have neighbours that move alike. Samples are therefore drawn from all matches, and
+from the better half, quarter and eighth by this measure or by the caller's score.
+
+The compiled loop is runtime/c/search.c; what is here does the same.
+
+References
+----------
+.. [1] O. Chum, T. Werner, J. Matas, "Two-view geometry estimation unaffected by a dominant plane",
+   CVPR 2005.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge import lm
+from epigauge._library import address, library
+from epigauge._native import check_sizes
+from epigauge.kernels import Table
+from epigauge.linear import Levenberg
+from epigauge.two_view.criteria import Sampson
+from epigauge.two_view.eliminated import EliminatedProblem
+from epigauge.two_view.losses import Loss
+from epigauge.two_view.parameterizations import Ortho
+
+__all__ = ["SCALES", "Found", "ranked", "search"]
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+#: Scale of the distances in conditioned coordinates, whose range is about 7: a seventh of a pixel
+#: in an image of 1000. And the part of its square that is rounding.
+SCALES, _FLOOR = (0.003, 0.02, 0.1), 0.01
+
+#: Samples at most and at least, and how many times more than give one without wrong matches: seven
+#: right ones with noise are seldom good enough.
+_SAMPLES, _LEAST, _PATIENCE = 20_000, 1_000, 5.0
+
+#: Threes of matches that a plane is tried from, and twos off it that F is.
+_PLANES, _PAIRS = 64, 512
+
+#: Iterations of a robust fit at most, and the widths of the fits in scales.
+_STEPS, _WIDTHS = 5, (8.0, 3.0, 1.5)
+
+#: Samples a batch, matches that judge all proposals of a batch, and proposals judged by all.
+_BATCH, _JUDGES, _FINALISTS = 64, 192, 6
+
+#: Shares of the matches, best first, that samples are drawn from in turns.
+_POOLS = (1.0, 0.5, 0.25, 0.125)
+
+#: Matches are near within this in each coordinate: 3 % of the image.
+_REACH = 0.2
+
+
+class _Options(ctypes.Structure):
+    _fields_ = (
+        ("seed", ctypes.c_uint64),
+        *((name, ctypes.c_ssize_t) for name in ("samples", "least")),
+        *((name, ctypes.c_int) for name in ("planes", "pairs", "steps", "widths")),
+        *((name, ctypes.c_double) for name in ("scale", "floor2", "patience")),
+        ("width", ctypes.c_double * 4),
+    )
+
+
+@cache
+def _functions() -> tuple[Any, Any]:
+    check_sizes({"eg_search_options": _Options})
+    pointer, size = ctypes.c_void_p, ctypes.c_ssize_t
+    find, near = library().eg_search, library().eg_neighbours
+    find.argtypes, find.restype = [size, *[pointer] * 5], size
+    near.argtypes, near.restype = [size, pointer, ctypes.c_double, pointer], None
+    return find, near
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search has found, in the coordinates of the matches.
+
+    Attributes
+    ----------
+    F : ndarray, shape (3, 3)
+        Zero where no sample gave any.
+    score : float
+        Its agreement.
+    samples : int
+        How many sevens were drawn.
+    scale : float
+        Scale of the distances.
+    """
+
+    F: Array
+    score: float
+    samples: int
+    scale: float
+
+
+def ranked(kernels: Table, q1: Array, q2: Array) -> Rows:
+    """Return the rows of the matches, those first whose neighbours move alike.
+
+    Parameters
+    ----------
+    kernels : Table
+        Backend.
+    q1, q2 : ndarray, shape (2, m)
+        Conditioned matches.
+    """
+    q, m = np.concatenate([q1, q2]), q1.shape[1]
+    share = np.empty(m)
+    if kernels.compiled:
+        _functions()[1](m, address(q), _REACH, address(share))
+    else:
+        for i in range(m):
+            near = np.abs(q - q[:, i : i + 1]) < _REACH
+            one, two = near[0] & near[1], near[2] & near[3]
+            both, ends = np.count_nonzero(one & two), np.count_nonzero(one) + np.count_nonzero(two)
+            share[i] = (both - 1.0) / (ends - 1.0)
+    return np.argsort(-share, kind="stable")
+
+
+def search(
+    kernels: Table,
+    q1: Array,
+    q2: Array,
+    order: Rows | None,
+    *,
+    seed: int = 0,
+    scale: float = SCALES[0],
+) -> Found:
+    """Search for the F that most matches agree on.
+
+    Parameters
+    ----------
+    kernels : Table
+        Backend.
+    q1, q2 : ndarray, shape (2, m)
+        Conditioned matches, at least seven.
+    order : ndarray of int, shape (m,), or None
+        Their rows, the most promising first; None if nothing is known.
+    seed : int
+        Of everything random.
+    scale : float
+        Distance that is as good as right, in the unit of the matches.
+
+    Returns
+    -------
+    Found
+        The best geometry.
+    """
+    q, m = np.concatenate([q1, q2]), q1.shape[1]
+    if not kernels.compiled:
+        return _Search(kernels, q, order, seed, scale).run()
+    width = (ctypes.c_double * 4)(*_WIDTHS)
+    numbers = (seed, _SAMPLES, _LEAST, _PLANES, _PAIRS, _STEPS, len(_WIDTHS))
+    options = _Options(*numbers, scale, _FLOOR, _PATIENCE, width)
+    order = None if order is None else np.ascontiguousarray(order, dtype=np.intp)
+    F, score = np.zeros((3, 3)), np.zeros(1)
+    samples = _functions()[0](
+        m, address(q), address(order), ctypes.addressof(options), address(F), address(score)
+    )
+    if samples < 0:
+        raise MemoryError(f"no room for {m} matches")
+    return Found(F, float(score[0]), samples, scale)
+
+
+@dataclass
+class _Search:
+    """The search in NumPy; method by method what the functions of search.c do."""
+
+    kernels: Table
+    q: Array
+    order: Rows | None
+    seed: int
+    scale: float
+    drawn: int = 0
+    F: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    score: float = 0.0
+
+    def run(self) -> Found:
+        with np.errstate(all="ignore"):  # samples in special position
+            samples = self.seven_points()
+            if self.score > 0.0:
+                self.plane_and_parallax()
+        return Found(self.F, self.score, samples, self.scale)
+
+    def draw(self, below: Array) -> Rows:
+        """Return whole numbers below some: SplitMix64 of a counter."""
+        count = np.arange(self.drawn + 1, self.drawn + below.size + 1, dtype=np.uint64)
+        self.drawn += below.size
+        z = np.uint64(self.seed % 2**64) + count * np.uint64(0x9E3779B97F4A7C15)
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        uniform = ((z ^ (z >> np.uint64(31))) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+        return (uniform.reshape(below.shape) * below).astype(np.intp)
+
+    def agreement(self, F: Array, q: Array) -> Array:
+        """Return the scores of many F, shape (k, 3, 3)."""
+        one = np.ones((1, q.shape[1]))
+        q1, q2 = np.concatenate([q[:2], one]), np.concatenate([q[2:], one])
+        line2, line1 = F @ q1, np.swapaxes(F, 1, 2) @ q2
+        C = np.sum(line2 * q2, axis=1)
+        length2 = np.sum(line2[:, :2] ** 2, axis=1) + np.sum(line1[:, :2] ** 2, axis=1)
+        scale2 = self.scale**2
+        ratio = scale2 * length2 / (C**2 + _FLOOR * scale2 * length2 + 1e-300)
+        return np.asarray(np.sum(np.log1p(ratio), axis=1))
+
+    def distances(self, F: Array) -> Array:
+        """Return squared distances; infinity for matches on the wrong side of an epipole."""
+        one = np.ones((1, self.q.shape[1]))
+        q1, q2 = np.concatenate([self.q[:2], one]), np.concatenate([self.q[2:], one])
+        line2, line1 = F @ q1, F.T @ q2
+        length2 = np.sum(line2[:2] ** 2, axis=0) + np.sum(line1[:2] ** 2, axis=0)
+        squared = np.sum(line2 * q2, axis=0) ** 2 / (length2 + 1e-300)
+        side = np.sum(np.cross(_epipole(F), q2, axisb=0, axisc=0) * line2, axis=0) > 0.0
+        most = 2 * np.count_nonzero(side) >= len(side)
+        return np.where(side == most, squared, np.inf)
+
+    def near(self, F: Array, limit: float) -> Rows:
+        return np.flatnonzero(self.distances(F) <= limit**2)
+
+    def improve(self, F: Array) -> None:
+        """Fit F to the matches around, wide first and then narrow; keep the best."""
+        chart = Ortho(self.kernels)
+        for width in self.scale * np.array(_WIDTHS):
+            rows = self.near(F, 3.0 * width)
+            if len(rows) < 8 or np.linalg.matrix_rank(F) < 2:
+                return
+            criterion = Sampson(self.kernels, *self.q[:, rows].reshape(2, 2, -1))
+            problem = EliminatedProblem(
+                criterion, chart, np.ones(len(rows)), Loss("truncated", width), exact=False
+            )
+            stopping = lm.Stopping(ftol=1e-4, xtol=1e-8, gtol=0.0, max_iter=_STEPS)
+            found = lm.minimize(problem, chart.start(F), Levenberg(), lm.Classic(), stopping)
+            if not np.isfinite(found.state.cost):
+                return
+            F = found.state.F
+            score = float(self.agreement(F[None], self.q)[0])
+            if score > self.score:
+                self.F, self.score = F, score
+
+    def best_of(self, F: Array, highest: float) -> float:
+        """Improve the best of a batch, where none before scored as high."""
+        if not len(F):
+            return highest
+        m = self.q.shape[1]
+        pool = m if self.order is None else (m + 1) // 2
+        judges = np.arange(min(pool, _JUDGES)) * pool // min(pool, _JUDGES)
+        judges = judges if self.order is None else self.order[judges]
+        first = self.agreement(F, self.q[:, judges])
+        finalists = np.argsort(-first, kind="stable")[:_FINALISTS]
+        scores = self.agreement(F[finalists], self.q)
+        best = int(np.argmax(scores))
+        if not scores[best] > highest:
+            return highest
+        self.improve(F[finalists[best]])
+        return float(scores[best])
+
+    def needed(self) -> float:
+        """Return how many samples find the best geometry so far with some confidence."""
+        near = len(self.near(self.F, 3.0 * self.scale))
+        samples = _PATIENCE * (self.q.shape[1] / max(near, 7.0)) ** 7
+        return float(min(max(samples, _LEAST), _SAMPLES))
+
+    def seven_points(self) -> int:
+        m = self.q.shape[1]
+        share = np.resize(_POOLS if self.order is not None else 1.0, _BATCH)
+        pool = np.maximum(min(14, m), np.trunc(share * m))
+        highest, most, done = 0.0, float(_SAMPLES), 0
+        while done < most:
+            rows = self.draw(np.repeat(pool[:, None], 7, axis=1))
+            rows = rows if self.order is None else self.order[rows]
+            sample = self.q[:, rows].transpose(0, 2, 1)
+            F, votes, discriminant = self.kernels.seven_points(
+                *(np.ascontiguousarray(half) for half in (sample[:2], sample[2:]))
+            )
+            done += _BATCH
+            real = np.array([np.ones(_BATCH, np.bool_), discriminant > 0.0, discriminant > 0.0])
+            chosen = np.nonzero((real & (np.abs(votes) == 7.0)).T)
+            proposals = _normalized(F.transpose(3, 0, 1, 2)[chosen])
+            before, highest = highest, self.best_of(proposals, highest)
+            if highest > before:
+                most = self.needed()
+        return done
+
+    def plane(self) -> tuple[int, Array]:
+        """Return how many matches that agree are on one plane, and its homography."""
+        rows = self.near(self.F, 3.0 * self.scale)
+        if len(rows) < 7:
+            return 0, np.eye(3)
+        limit = 3.0 * self.scale * 2.0**0.5
+        e2 = _epipole(self.F)
+        e2 /= np.linalg.norm(e2)
+        q1, q2 = self.q[:, rows].reshape(2, 2, -1)
+        kappa, gain = self.kernels.plane_parallax(self.F, e2, q1, q2)
+        three = self.draw(np.full((_PLANES, 3), float(len(rows))))
+        xy = q1[:, three] - q1[:, three[:, :1]]
+        k = kappa[three] - kappa[three[:, :1]]
+        area = xy[0, :, 1] * xy[1, :, 2] - xy[1, :, 1] * xy[0, :, 2]
+        v0 = (k[:, 1] * xy[1, :, 2] - k[:, 2] * xy[1, :, 1]) / area
+        v1 = (xy[0, :, 1] * k[:, 2] - xy[0, :, 2] * k[:, 1]) / area
+        v2 = kappa[three[:, 0]] - v0 * q1[0, three[:, 0]] - v1 * q1[1, three[:, 0]]
+        planes = np.stack([v0, v1, v2], axis=1)
+        off = gain * (kappa - planes @ np.concatenate([q1, np.ones((1, len(rows)))]))
+        counts = np.count_nonzero(np.abs(off) < limit, axis=1)
+        counts[~np.isfinite(planes).all(axis=1)] = 0
+        best = int(np.argmax(counts))
+        v = planes[best] if counts[best] else np.zeros(3)
+        return int(counts[best]), np.cross(e2, self.F, axisb=0, axisc=0) + np.outer(e2, v)
+
+    def plane_and_parallax(self) -> None:
+        """Try F = [e']x H of the plane's homography and two matches off it."""
+        count, H = self.plane()
+        if count < 7:
+            return
+        q1, q2 = self.q[:2], self.q[2:]
+        squared = self.kernels.homography_squared(H, q1, q2)
+        rows = np.flatnonzero(squared > (9.0 * self.scale) ** 2)
+        if len(rows) < 2:
+            return
+        one = np.ones((1, len(rows)))
+        there = H @ np.concatenate([q1[:, rows], one])
+        lines = np.cross(there, np.concatenate([q2[:, rows], one]), axis=0).T
+        highest = 0.0
+        for _ in range(0, _PAIRS, _BATCH):
+            two = lines[self.draw(np.full((_BATCH, 2), float(len(rows))))]
+            e2 = np.cross(two[:, 0], two[:, 1])
+            F = np.cross(e2[:, :, None], H[None], axis=1)
+            highest = self.best_of(_normalized(F), highest)
+
+
+def _epipole(F: Array) -> Array:
+    """Return the epipole in the second image, of any length."""
+    candidates = np.cross(F, np.roll(F, -1, axis=1), axis=0)
+    return np.asarray(candidates[:, np.argmax(np.sum(candidates**2, axis=0))])
+
+
+def _normalized(F: Array) -> Array:
+    """Return matrices of unit norm; those that are zero or not finite are left out."""
+    norms = np.sqrt(np.sum(F**2, axis=(1, 2)))
+    there = (norms > 0.0) & np.isfinite(norms)
+    return np.asarray(F[there] / norms[there, None, None])
