@@ -120,6 +120,13 @@ def test_numbers_are_printed_to_the_last_bit(number, text):
     assert eval(text) == float(number)
 
 
+@pytest.mark.parametrize("power", [2, 3, -2])
+def test_the_base_of_a_power_is_computed_once(power):
+    files = numpy_emitter.emit([compile_kernel(toy((X + Y) ** power))])
+    (text,) = (text for name, text in files.items() if not name.endswith("__init__.py"))
+    assert len(re.findall(r"x ?\+ ?y", text)) == 1
+
+
 def random_expression(rng, depth):
     """Return an expression of any of the nodes that have a rule."""
     if depth == 0:
