@@ -51,7 +51,7 @@ def spoilt(n: int, wrong: int) -> tuple[Array, Array]:
 KINDS = {
     "general": moved(80, [0.8, 0.1, 0.2]),
     "still": moved(80, [0.0, 0.0, 0.0]),
-    "planar": plane(80, 0, seed=2),
+    "planar": plane(400, 0, seed=3),
     "planar, two wrong": plane(80, 2, seed=2),
     "some wrong": spoilt(80, 16),
     "random": spoilt(60, 60),
@@ -93,7 +93,7 @@ def test_kinds_have_the_verdicts_that_they_must_have() -> None:
     told = {kind: eg.refine_fundamental(*x).flags for kind, x in KINDS.items()}
     assert told["general"] == ()
     assert "still camera" in told["still"]
-    assert "planar scene" in told["planar"]
+    assert told["planar"] == ("planar scene",)  # nothing else makes it degenerate
     assert {"planar scene", "nearly planar"} & set(told["planar, two wrong"])
     assert "gross errors" in told["some wrong"]
     assert "no common geometry" in told["random"]
