@@ -212,7 +212,7 @@ def test_table4_finds_one_minimum_a_pair(data_dir, tmp_path):
     # Two small pairs, one with epipoles near, one with epipoles far
     for name in ("kusvod2_kampa", "kusvod2_zoom"):
         (tmp_path / f"{name}.npz").write_bytes((data_dir / "pairs" / f"{name}.npz").read_bytes())
-    section = bs2004.EXPERIMENTS["table4"](Study(trials=1, pairs=tmp_path))
+    section = bs2004.EXPERIMENTS["table4"](Study(trials=1, data=tmp_path))
     tables = {item.name: item for item in section.content if isinstance(item, Table)}
     assert [row[:3] for row in tables["table4_error"].rows] == [
         ("near", "near", "kusvod2_kampa"),

@@ -11,8 +11,8 @@ import pytest
 pytest.importorskip("matplotlib", reason="reports need matplotlib")
 
 from epigauge.reproduce import metrology
-from epigauge.reproduce.metrology import MetrologyStudy
 from epigauge.reproduce.report import Table
+from epigauge.reproduce.study import Experiments
 
 
 def test_simulated_runs_differ_by_noise_of_half_a_pixel() -> None:
@@ -40,13 +40,13 @@ def test_an_estimate_is_moved_to_where_it_agrees_in_the_datum() -> None:
 
 
 def test_coverage_has_a_row_a_model_datum_and_part() -> None:
-    section = metrology.coverage(MetrologyStudy(2))
+    section = metrology.coverage(Experiments(2))
     table = next(item for item in section.content if isinstance(item, Table))
     assert len(table.rows) == 3 * 3 * 3
     assert all(0.0 <= row[3] <= 100.0 and row[4] > 0.0 for row in table.rows)
 
 
 def test_the_network_is_told_to_be_missing(tmp_path: Path) -> None:
-    section = metrology.network(MetrologyStudy(1, data=tmp_path))
+    section = metrology.network(Experiments(1, data=tmp_path))
     assert "EPIGAUGE_DATA" in section.content[0]
     assert not section.claims

@@ -21,7 +21,7 @@ from epigauge.reproduce import b2003, bs2004, gauges_metric, metrology
 from epigauge.reproduce.common import Study
 from epigauge.reproduce.gauge_runs import GaugeStudy
 from epigauge.reproduce.gauges_metric import MetricGaugeStudy
-from epigauge.reproduce.metrology import MetrologyStudy
+from epigauge.reproduce.study import Experiments
 
 
 class Paper(StrEnum):
@@ -72,7 +72,7 @@ def reproduce(
         return track(items, label, console=out, transient=True, disable=not out.is_terminal)
 
     data = Path(os.environ.get("EPIGAUGE_DATA", Path("..", "shared", "data")))
-    study: Study | GaugeStudy | MetricGaugeStudy | MetrologyStudy
+    study: Experiments
     measured = data if data.is_dir() else None
     if paper is Paper.bs2004:
         pairs = data / "pairs"
@@ -82,7 +82,7 @@ def reproduce(
     elif paper is Paper.gauges_metric:
         work, study = gauges_metric.PAPER, MetricGaugeStudy(trials, seed, measured, progress)
     else:
-        work, study = metrology.PAPER, MetrologyStudy(trials, seed, measured, progress)
+        work, study = metrology.PAPER, Experiments(trials, seed, measured, progress)
     for path in work.reproduce(output, study, _machine(), names):
         out.print(escape(shown(path)), soft_wrap=True)
     return DONE

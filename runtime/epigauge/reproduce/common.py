@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import kernels, lm
+from epigauge.reproduce.study import Experiments
 from epigauge.scenes import TwoViewScene, two_view_scene
 from epigauge.two_view.conditioning import Conditioning
 from epigauge.two_view.geometry import reprojection_distances
@@ -30,12 +29,9 @@ __all__ = [
     "Study",
     "converge",
     "reprojection_rms",
-    "tracked",
 ]
 
 Array = NDArray[np.float64]
-T = TypeVar("T")
-Track = Callable[[Sequence[Any], str], Iterable[Any]]
 
 #: The paper's two step controls by our names.
 LM, SEBER = "levenberg", "seber"
@@ -193,31 +189,14 @@ def converge(
     )
 
 
-def tracked(items: Sequence[T], _label: str) -> Iterable[T]:
-    """Show no progress."""
-    return items
-
-
 @dataclass
-class Study:
-    """What all experiments are run with; simulated runs are made once and remembered.
+class Study(Experiments):
+    """Experiments on two views; simulated runs are made once and remembered.
 
-    Parameters
-    ----------
-    trials : int
-        Trials a configuration; trial k has the seed `seed` + k.
-    seed : int
-        First seed.
-    pairs : path, optional
-        Directory of measured image pairs, or None where there is none.
-    track : callable
-        Wraps the items of a loop, given its label, to show progress.
+    The data are the directory of the measured image pairs.
     """
 
     trials: int = 25
-    seed: int = 0
-    pairs: Path | None = None
-    track: Track = tracked
     _scenes: dict[Setup, TwoViewScene] = field(default_factory=dict)
     _runs: dict[tuple[Any, ...], Run] = field(default_factory=dict)
 

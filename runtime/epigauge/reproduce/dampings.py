@@ -66,8 +66,8 @@ def dampings_section(study: Study) -> Section:
     for setup in study.setups():
         scene = study.scene(setup)
         data["standard scene"].append((scene.x1, scene.x2, study.initial(setup)))
-    if study.pairs is not None:
-        data["measured pairs"] = [(pair.x1, pair.x2, pair.F0) for pair in load_pairs(study.pairs)]
+    if study.data is not None:
+        data["measured pairs"] = [(pair.x1, pair.x2, pair.F0) for pair in load_pairs(study.data)]
     cases = [
         (where, coordinates, damping, method)
         for where in data

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from epigauge.multi_view.gauge import Gauge, Transformation, identity, normalize
 from epigauge.multi_view.initialize import initialize
 from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.tracks import Tracks
-from epigauge.reproduce.common import Track, tracked
+from epigauge.reproduce.study import Experiments
 from epigauge.scenes import multi_view_scene
 
 __all__ = [
@@ -73,25 +72,9 @@ _FTOL, _MAX_ITER = 1e-8, 100
 
 
 @dataclass
-class GaugeStudy:
-    """What all experiments are run with; runs are made once and remembered.
+class GaugeStudy(Experiments):
+    """Experiments on many views; runs are made once and remembered."""
 
-    Parameters
-    ----------
-    trials : int
-        Trials a configuration; trial k has the seed `seed` + k.
-    seed : int
-        First seed.
-    data : path, optional
-        Directory of measured data, or None where there is none.
-    track : callable
-        Wraps the items of a loop, given its label, to show progress.
-    """
-
-    trials: int = 10
-    seed: int = 0
-    data: Path | None = None
-    track: Track = tracked
     _starts: dict[tuple[float, int], tuple[Tracks, Reconstruction]] = field(default_factory=dict)
     _runs: dict[tuple[float, int, str], BundleResult] = field(default_factory=dict)
 
@@ -117,8 +100,8 @@ class GaugeStudy:
 
     def measured(self, name: str, step: int = 1) -> Tracks | None:
         """Return a measured sequence, its clean tracks in every `step`-th view, or None."""
-        path = None if self.data is None else self.data / name / "tracks.npz"
-        if path is None or not path.is_file():
+        path = self.file(name, "tracks.npz")
+        if path is None:
             return None
         with np.load(path, allow_pickle=False) as file:
             view, point, xy = file["view"], file["point"], file["xy"]

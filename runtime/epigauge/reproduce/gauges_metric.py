@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,9 @@ from epigauge.errors import ArgumentError
 from epigauge.io import load_scene
 from epigauge.multi_view.adjust import BundleResult, bundle_adjust
 from epigauge.multi_view.tracks import Tracks
-from epigauge.reproduce.common import Track, tracked
 from epigauge.reproduce.report import Claim, Section, Table, fewest
 from epigauge.reproduce.run import Paper
+from epigauge.reproduce.study import Experiments
 from epigauge.rotations import from_rodrigues
 from epigauge.scenes import multi_view_scene
 
@@ -56,25 +55,9 @@ _PROBLEMS = {"BAL-49": "problem-49-7776-pre.txt.bz2", "BAL-16": "problem-16-2210
 
 
 @dataclass
-class MetricGaugeStudy:
-    """What the experiments are run with; runs are made once and remembered.
+class MetricGaugeStudy(Experiments):
+    """Experiments on calibrated cameras; runs are made once and remembered."""
 
-    Parameters
-    ----------
-    trials : int
-        Trials a configuration; trial k has the seed `seed` + k.
-    seed : int
-        First seed.
-    data : path, optional
-        Directory of measured data, or None where there is none.
-    track : callable
-        Wraps the items of a loop, given its label, to show progress.
-    """
-
-    trials: int = 10
-    seed: int = 0
-    data: Path | None = None
-    track: Track = tracked
     _runs: dict[tuple[float, int, str], BundleResult | None] = field(default_factory=dict)
 
     def start(self, flatness: float, trial: int) -> Scene:
@@ -106,8 +89,8 @@ class MetricGaugeStudy:
 
     def problem(self, name: str) -> Scene | None:
         """Return a measured problem, or None where it is not there."""
-        path = None if self.data is None else self.data / "bal" / _PROBLEMS[name]
-        return None if path is None or not path.is_file() else load_scene(path)
+        path = self.file("bal", _PROBLEMS[name])
+        return None if path is None else load_scene(path)
 
 
 def adjust(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,12 @@ from epigauge.multi_view.adjust import bundle_adjust
 from epigauge.multi_view.gauge import five_points, similarity, transform, two_cameras
 from epigauge.multi_view.tracks import Tracks
 from epigauge.multi_view.uncertainty import covariance
-from epigauge.reproduce.common import Track, tracked
 from epigauge.reproduce.report import Claim, Section, Table
 from epigauge.reproduce.run import Paper
+from epigauge.reproduce.study import Experiments
 from epigauge.rotations import from_rodrigues
 
-__all__ = ["EXPERIMENTS", "PAPER", "MetrologyStudy", "load_network"]
+__all__ = ["EXPERIMENTS", "PAPER", "load_network"]
 
 Array = NDArray[np.float64]
 
@@ -30,28 +29,6 @@ _MODELS = {"pinhole": ("fx", "fy"), "bal": ("f", "k1"), "brown": ("c", "A1")}
 _NOISE = 0.5
 #: 95 % points of chi-square by degrees of freedom.
 _CHI2 = {2: 5.991, 3: 7.815}
-
-
-@dataclass
-class MetrologyStudy:
-    """What the experiments are run with.
-
-    Parameters
-    ----------
-    trials : int
-        Simulated runs a model; run k has the seed `seed` + k.
-    seed : int
-        First seed.
-    data : path, optional
-        Directory of measured data, or None where there is none.
-    track : callable
-        Wraps the items of a loop, given its label, to show progress.
-    """
-
-    trials: int = 10
-    seed: int = 0
-    data: Path | None = None
-    track: Track = tracked
 
 
 def load_network(
@@ -93,11 +70,11 @@ def aligned(
     return transform(reconstruction, similarity(s, R, shift))
 
 
-def network(study: MetrologyStudy) -> Section:
+def network(study: Experiments) -> Section:
     """Adjust the network from its start and compare with the commercial report."""
     title = "A network of 115 views against its commercial report"
-    path = None if study.data is None else study.data / "metrology_aicon" / "network.npz"
-    if path is None or not path.is_file():
+    path = study.file("metrology_aicon", "network.npz")
+    if path is None:
         return Section(title, ["No measured data was found: set EPIGAUGE_DATA."])
     file, tracks, start, bar = load_network(path)
     free = tuple(file["camera_names"].tolist())
@@ -198,7 +175,7 @@ def _moved_to(
     return transform(found, similarity(s, R, back.positions(here.positions(np.zeros((1, 3))))[0]))
 
 
-def coverage(study: MetrologyStudy) -> Section:
+def coverage(study: Experiments) -> Section:
     """Count how often the truth lies in the regions of 95 %, and compare standard deviations."""
     datums: dict[str, Any] = {
         "inner": "inner",
@@ -277,13 +254,13 @@ def coverage(study: MetrologyStudy) -> Section:
 
 
 #: The experiments by name, in the order of the report.
-EXPERIMENTS: dict[str, Callable[[MetrologyStudy], Section]] = {
+EXPERIMENTS: dict[str, Callable[[Experiments], Section]] = {
     "network": network,
     "coverage": coverage,
 }
 
 
-def introduction(study: MetrologyStudy) -> list[str]:
+def introduction(study: Experiments) -> list[str]:
     """Return the paragraphs above the claims."""
     return [
         "Covariances of calibrated cameras, their intrinsics and points, checked twice: by the "

@@ -110,7 +110,7 @@ def table4(study: Study) -> Section:
         The experiment.
     """
     title = "Table 4: measured image pairs"
-    pairs = [] if study.pairs is None else load_pairs(study.pairs)
+    pairs = [] if study.data is None else load_pairs(study.data)
     if not pairs:
         return Section(
             title,

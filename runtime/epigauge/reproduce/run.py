@@ -45,7 +45,7 @@ class Paper:
         directory : path
             Where NAME.md, NAME.html and the directory NAME with CSV and PNG files go; made if
             absent.
-        study : Study or GaugeStudy
+        study : Experiments
             Trials, seeds and data.
         machine : mapping of str to str
             What the report says about processor and versions.
