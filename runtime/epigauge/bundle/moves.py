@@ -77,8 +77,8 @@ def move_into(gauge: Gauge, model: CameraModel, cameras: Array, points: Array) -
     """Return what moves an estimate into a gauge."""
     if model.homogeneous:
         return _Projective(gauge.transformation(cameras.reshape(-1, 3, 4), points))
-    if not model.metric and isinstance(gauge, identity):
-        return _Affine(np.eye(4))
+    if not model.metric and isinstance(gauge, identity | normalized):
+        return _Affine(np.eye(4)) if isinstance(gauge, identity) else _spread_evenly(points)
     similarity: Any = getattr(gauge, "similarity", None)
     if not model.metric or similarity is None:
         was = f"is {gauge!r:.60} for cameras of the model {model.name!r}"

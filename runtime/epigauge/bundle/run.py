@@ -139,9 +139,12 @@ def minimized(
         what = "damping" if damping else "method"
         needed = "a projective start, or another method"
         raise ArgumentError(what, f"is {name!r} for {job.model.name} cameras", needed)
-    if strategy.gauge is not None and not (job.model.metric or job.model.homogeneous):
+    affine = not (job.model.metric or job.model.homogeneous)
+    if affine and strategy.reference:
         was = f"is {method!r} for {job.model.name} cameras, which have no gauge of that name"
-        raise ArgumentError("method", was, "'covariant', 'levenberg', 'marquardt' or 'free'")
+        others = (name for name, own in STRATEGIES.items() if not own.reference)
+        usable = ", ".join(name for name in others if name not in PROJECTIVE_ONLY)
+        raise ArgumentError("method", was, f"one of {usable}")
     act: Any = DAMPINGS[name](kernels)
     if isinstance(act, Covariant) and job.model.metric:
         act = Covariant(LAM_FLOOR_METRIC)

@@ -66,7 +66,7 @@ class InGauge(Freedom):
         """Return the normal equations, constrained where asked for.
 
         Homogeneous: unit norms, and sum Q Q^T fixed (ten conditions). Metric: the points' mean and
-        their mean square distance from it (four).
+        their mean square distance from it (four). Affine: their mean and covariance (nine).
         """
         assert self.model is not None
         if not self.with_constraints:
@@ -74,9 +74,8 @@ class InGauge(Freedom):
         weight = float(np.mean(np.einsum("nii->ni", normal.V)))
         none = np.zeros((*normal.g_cameras.shape, 0))
         if not self.model.homogeneous:
-            columns = np.concatenate(
-                [np.tile(np.eye(3), (len(points), 1, 1)), points[:, :, None]], 2
-            )
+            moved = points[:, :, None] if self.model.metric else _squares(points)
+            columns = np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), moved], 2)
             border = np.sqrt(weight / len(points)) * columns
             return normal, Border(np.zeros((*none.shape[:2], border.shape[2])), border)
         p, q = scales(cameras, points)
@@ -87,6 +86,16 @@ class InGauge(Freedom):
             V=normal.V + weight * q[:, :, None] * q[:, None, :],
         )
         return normal, Border(np.zeros((*none.shape[:2], border.shape[2])), border)
+
+
+def _squares(points: Array) -> Array:
+    """Return the derivatives (m, 3, 6) of the distinct entries of X X^T."""
+    i, j = np.triu_indices(3)
+    columns = np.zeros((len(points), 3, 6))
+    for k, (a, b) in enumerate(zip(i.tolist(), j.tolist(), strict=True)):
+        columns[:, a, k] += points[:, b]
+        columns[:, b, k] += points[:, a]
+    return columns
 
 
 @dataclass(frozen=True)

@@ -189,7 +189,7 @@ def transform(
         kinds = isinstance(reconstruction, MetricReconstruction), isinstance(T, Similarity)
         if not isinstance(reconstruction, MetricReconstruction) or not isinstance(T, Similarity):
             what = "is a similarity" if kinds[1] else "is no similarity"
-            kind = "metric" if kinds[0] else "projective"
+            kind = "metric" if kinds[0] else "not"
             needed = "eg.gauge.similarity(s, R, t)" if kinds[0] else "a (4, 4) matrix"
             raise ArgumentError("T", f"{what}, the reconstruction {kind}", needed)
         _no_scales("metric", camera_scales, point_scales)
