@@ -21,7 +21,7 @@ _TURN = 0.006
 _PLACE = 1e-3
 
 #: A point that all views look at stays within this share of width plus height in all images.
-_STILL = 0.004
+_STILL = 0.008
 
 
 def motion_flags(

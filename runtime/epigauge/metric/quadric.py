@@ -277,6 +277,7 @@ class _Refinement:
     def __init__(self, views: Views) -> None:
         self.views = views
 
+    @np.errstate(all="ignore")
     def evaluate(self, H: Array) -> _State:
         M = self.views.P @ H
         scale = np.linalg.norm(M[:, :, :3]) / max(float(np.linalg.norm(M[:, :, 3])), 1e-300)

@@ -21,7 +21,7 @@ from epigauge.multi_view.tracks import Tracks
 from epigauge.multi_view.uncertainty import covariance
 from epigauge.two_view.losses import median
 
-__all__ = ["MODELS", "Candidate", "Fit", "Search"]
+__all__ = ["MODELS", "Candidate", "Fit", "Search", "metric_of"]
 
 Array = NDArray[np.float64]
 
@@ -95,6 +95,13 @@ class Fit:
     ahead: float
 
 
+def metric_of(bundle: BundleResult) -> MetricReconstruction:
+    """Return the reconstruction of an adjustment that began from a metric one."""
+    found = bundle.reconstruction
+    assert isinstance(found, MetricReconstruction)
+    return found
+
+
 class Search:
     """A sample of tracks, and what is asked of it.
 
@@ -157,7 +164,7 @@ class Search:
     def _projective(self, given: Reconstruction | None, robust: bool) -> BundleResult:
         """Return a projective reconstruction of the sample, robustly adjusted."""
         if given is None:
-            start = initialize(self.sample.tracks, robust=robust, backend=self.backend)
+            start = initialize(self.sample.tracks, robust=robust, backend=self.options["backend"])
         else:
             start = Reconstruction(given.P, given.Q[self.sample.points])
         options = self.options
@@ -196,12 +203,14 @@ class Search:
             tried[0][1].ahead,
         )
 
-    def _adjusted(self, scene: MetricReconstruction, names: tuple[str, ...]) -> Any:
+    def _adjusted(
+        self, scene: MetricReconstruction, names: tuple[str, ...]
+    ) -> MetricReconstruction:
         """Return the scene after a robust adjustment of poses, points and some intrinsics."""
         found = bundle_adjust(
             self.sample.tracks, scene, refine=names, loss="cauchy", ftol=1e-4, **self.options
         )
-        return found.reconstruction
+        return metric_of(found)
 
     def _first(self) -> tuple[str, ...]:
         """Return the names of the focal lengths."""

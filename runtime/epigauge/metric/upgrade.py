@@ -16,7 +16,7 @@ from epigauge.metric.motion import motion_flags
 from epigauge.metric.pair import OPEN, WEAK
 from epigauge.metric.samples import sampled
 from epigauge.metric.scene import Images, with_all_points
-from epigauge.metric.search import MODELS, Candidate, Fit, Search
+from epigauge.metric.search import MODELS, Candidate, Fit, Search, metric_of
 from epigauge.multi_view.adjust import BundleResult, bundle_adjust
 from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.tracks import MIN_VIEWS, Tracks
@@ -221,24 +221,29 @@ def metric_upgrade(
 def _in_front(tracks: Tracks, start: MetricReconstruction, options: Any) -> BundleResult:
     """Return the adjustment without gross errors, and without points behind cameras that see them.
 
-    These agree with the cameras by chance: two of their observations are on epipolar lines.
+    These agree with the cameras by chance: two of their observations are on epipolar lines. What is
+    set aside is found by adjustments that stop early; the last one, of what is left, does not.
     """
     weights = np.asarray(tracks.weights)
     for _ in range(_ROUNDS):
-        bundle = bundle_adjust(tracks.weighted(weights), start, robust=True, ftol=1e-6, **options)
-        assert isinstance(bundle.reconstruction, MetricReconstruction)
-        start = bundle.reconstruction
-        counts = ~bundle.rejected & (weights > 0.0)
-        behind = np.zeros(tracks.n_points, dtype=np.bool_)
-        behind[tracks.point[counts & ~(start.depths(tracks) > 0.0)]] = True
-        if not behind.any():
+        rough = bundle_adjust(tracks.weighted(weights), start, robust=True, ftol=1e-4, **options)
+        start = metric_of(rough)
+        weights = np.where(rough.rejected, 0.0, weights)
+        seen_behind = (weights > 0.0) & ~(start.depths(tracks) > 0.0)
+        if not seen_behind.any():
             break
+        behind = np.zeros(tracks.n_points, dtype=np.bool_)
+        behind[tracks.point[seen_behind]] = True
         weights = np.where(behind[tracks.point], 0.0, weights)
-    flags = bundle.flags
-    if not behind.any():
-        flags = tuple(flag for flag in flags if flag != "behind the cameras")
-    rejected = bundle.rejected | ((weights == 0.0) & (tracks.weights > 0.0))
-    return replace(bundle, rejected=rejected, flags=flags)
+    bundle = bundle_adjust(tracks.weighted(weights), start, ftol=1e-8, **options)
+    ahead = metric_of(bundle).depths(tracks) > 0.0
+    flags = set(bundle.flags) | set(rough.flags)
+    if ahead[weights > 0.0].all():
+        flags.discard("behind the cameras")
+    rejected = (weights == 0.0) & (tracks.weights > 0.0)
+    count = f"{np.count_nonzero(rejected)} of {len(tracks)}"
+    message = f"{bundle.message}; {count} observations set aside as gross errors"
+    return replace(bundle, rejected=rejected, flags=ordered(flags), message=message)
 
 
 def _judged(
