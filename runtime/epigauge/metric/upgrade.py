@@ -255,8 +255,7 @@ def _judged(
     backend: str | None,
 ) -> MetricUpgrade:
     """Return the result of an adjustment, with standard deviations and flags."""
-    found = bundle.reconstruction
-    assert isinstance(found, MetricReconstruction)
+    found = metric_of(bundle)
     focal, known = _focal_lengths(found), None
     weights = np.where(bundle.rejected, 0.0, tracks.weights)
     flags, turn_std = set(bundle.flags), 0.0
