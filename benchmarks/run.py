@@ -31,7 +31,7 @@ TABLES: dict[str, list[str]] = {
     "kernels.py": [],
     "many_views.py": ["--plot", "growth.png"],
     "metric_views.py": [],
-    "covariances.py": [],
+    "covariances.py": ["--peers"],
     "sequences.py": [],
     "imports.py": [],
 }

@@ -230,6 +230,8 @@ def cases() -> dict[str, Any]:
     found["a bar"] = tracks, scene, intrinsics | {"priors": bar}
     found["control points"] = tracks, scene, intrinsics | {"priors": points}
     found["fixed"] = tracks, scene, {"refine": "pose", "fixed_views": [1], "fixed_points": [4, 5]}
+    found["all views fixed"] = tracks, scene, {"refine": "pose", "fixed_views": range(5)}
+    found["all points fixed"] = tracks, scene, {"refine": "pose", "fixed_points": range(20)}
     found["seen twice"] = twice(tracks, 30), scene, intrinsics
     # Two groups of views with one common point, each tied to the ground.
     tracks, scene = metric_scene("PINHOLE", 5, n_points=24, n_views=6, n_cameras=1, visible=1.0)

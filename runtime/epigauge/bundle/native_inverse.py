@@ -104,4 +104,4 @@ class NativeBlocks:
 
     def _blocks(self, X: Array) -> Array:
         how = self.linearizer.pair_sums
-        return X.reshape(len(X), -1, how.length)[:, : how.d, : how.d]
+        return X.reshape(len(X), how.d, how.length)[:, :, : how.d]

@@ -444,7 +444,7 @@ class NativePairs:
         """Return the blocks (l, k, k), rows for the column of the skyline's row."""
         own, d = self.linearizer, self.linearizer.width
         if self.how.size == d * d:
-            return self.sums.reshape(-1, d, d)
+            return self.sums.reshape(len(self.sums), d, d)
         found = np.empty((len(self.sums), d, d))
         arrays = map(address, (self.sums, found))
         function("bundle_pair_blocks")(own.reference, len(found), *arrays)
