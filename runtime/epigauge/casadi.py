@@ -32,6 +32,11 @@ def functions() -> dict[str, Any]:
     ------
     BackendError
         If CasADi is not installed; the message says how to get it.
+
+    Examples
+    --------
+    >>> F = eg.casadi.functions()  # doctest: +SKIP
+    >>> F["sampson"]  # doctest: +SKIP
     """
     reason = kernels.available()["casadi"]
     if reason is not None:

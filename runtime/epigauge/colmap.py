@@ -208,6 +208,11 @@ def refine_database(
     `colmap image_undistorter` and matching anew give pairs that F can describe. COLMAP takes the
     motion of calibrated pairs from E; F counts for uncalibrated pairs and for focal lengths found
     from F.
+
+    Examples
+    --------
+    >>> found = eg.colmap.refine_database("database.db")  # doctest: +SKIP
+    >>> print(found)  # doctest: +SKIP
     """
     # Here, since a Python may come without SQLite
     from epigauge.io.colmap import ColmapDatabase

@@ -74,6 +74,12 @@ def move_points(x: ArrayLike, source: str, target: str) -> Array:
     -------
     ndarray, shape (..., 2)
         x + 0.5 from OpenCV to COLMAP.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.interop.move_points([[0.0, 0.0]], "opencv", "colmap")
+    array([[0.5, 0.5]])
     """
     points = as_real("x", x, "an (m, 2) array")
     if not points.ndim or points.shape[-1] != 2:
@@ -97,6 +103,14 @@ def move_fundamental(F: ArrayLike, source: str, target: str) -> Array:
     -------
     ndarray, shape (3, 3)
         S^T F S with the translation S from the target's pixels to the source's; not scaled.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.two_view_scene(5.0, seed=1)
+    >>> F = eg.fundamental_8point(scene.x1, scene.x2)
+    >>> eg.interop.move_fundamental(F, "opencv", "colmap").shape
+    (3, 3)
     """
     S = np.eye(3)
     S[:2, 2] = -_shift(source, target)

@@ -75,6 +75,12 @@ def available() -> dict[str, str | None]:
     -------
     dict of str to str or None
         For each backend None where it can be used, else the reason why not.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.kernels.available()["numpy"] is None
+    True
     """
     reasons: dict[str, str | None] = {"numpy": None}
     try:
@@ -94,6 +100,12 @@ def backend() -> str:
     -------
     str
         One of ``"c"``, ``"numpy"``, ``"casadi"``.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.backend() in ("c", "numpy", "casadi")
+    True
     """
     global _active
     with _lock:
@@ -116,6 +128,11 @@ def set_backend(name: str) -> None:
         If there is no backend of this name.
     BackendError
         If it cannot be used here; the message says how to get it.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.set_backend(eg.backend())
     """
     global _active
     chosen = table(name).name
@@ -142,6 +159,12 @@ def table(name: str | None = None) -> Table:
         If there is no backend of this name.
     BackendError
         If it cannot be used here; the message says how to get it.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.kernels.table("numpy").name
+    'numpy'
     """
     chosen = backend() if name is None else as_choice("backend", name, NAMES)
     if chosen == "c":

@@ -102,6 +102,12 @@ def two_view_scene(
     ----------
     .. [BS04] A. Bartoli, P. Sturm, "Nonlinear estimation of the fundamental matrix with
        minimal parameters", PAMI 26(3), 2004, section 5.1.1.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.two_view_scene(distance=5.0, n_points=30, seed=1).x1.shape
+    (30, 2)
     """
     distance = as_positive("distance", distance)
     baseline = as_positive("baseline", baseline)
@@ -229,6 +235,12 @@ def multi_view_scene(
     References
     ----------
     .. [B03] A. Bartoli, "Towards gauge invariant bundle adjustment", ICCV 2003, section 7.1.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.multi_view_scene(n_points=20, seed=1).tracks
+    Tracks(5 views, 20 points, 100 observations)
     """
     distance, baseline = as_positive("distance", distance), as_positive("baseline", baseline)
     focal, cube = as_positive("focal", focal), as_positive("cube", cube)

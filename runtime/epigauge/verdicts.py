@@ -204,6 +204,11 @@ def ordered(names: Iterable[str]) -> tuple[str, ...]:
     ------
     KeyError
         On a name that is not in the vocabulary.
+
+    Examples
+    --------
+    >>> ordered({"near-affine", "planar scene"})
+    ('planar scene', 'near-affine')
     """
     raised = set(names)
     if unknown := raised - FLAGS.keys():
@@ -225,6 +230,11 @@ def usable(names: Iterable[str], kind: Kind) -> bool:
     -------
     bool
         False where a flag spoils results of this kind.
+
+    Examples
+    --------
+    >>> usable(["near-affine"], "F")
+    True
     """
     return not any(kind in FLAGS[name].spoils for name in names)
 
@@ -241,6 +251,11 @@ def explained(names: Iterable[str]) -> dict[str, str]:
     -------
     dict of str to str
         Two sentences a flag.
+
+    Examples
+    --------
+    >>> list(explained(["near-affine"]))
+    ['near-affine']
     """
     return {
         name: f"{_capital(FLAGS[name].sentence)}. {_capital(FLAGS[name].remedy)}." for name in names

@@ -15,7 +15,8 @@ from epigauge.datasets import DatasetError, _store
 from epigauge.errors import MissingPackageError
 
 OPTIONAL = (
-    *("cv2", "casadi", "matplotlib", "poselib", "pycolmap", "rich", "sympy", "torch", "typer"),
+    *("cv2", "casadi", "matplotlib", "poselib", "pycolmap", "rich", "scipy", "sympy", "torch"),
+    "typer",
 )
 #: Public modules beside the package itself, by the name that users write.
 MODULES = {

@@ -51,6 +51,12 @@ def names(kind: str | None = None) -> tuple[str, ...]:
     -------
     tuple of str
         In the order of the catalogue.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> "corridor" in eg.datasets.names()
+    True
     """
     if kind not in (None, "tracks", "matches"):
         raise ArgumentError("kind", f"is {kind!r}", "'tracks', 'matches' or None")
@@ -74,6 +80,12 @@ def describe(name: str) -> Dataset:
     ------
     ArgumentError
         If there is no such set; the message names those with similar names.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.datasets.describe("corridor").kind
+    'tracks'
     """
     entry = catalogue().get(name) if isinstance(name, str) else None
     if entry is None:
@@ -106,6 +118,10 @@ def path(name: str, *, base_url: str = PUBLIC) -> Path:
         one, or a set that is not offered for download.
     MissingPackageError
         If it has to be fetched and the extra ``data`` is not installed.
+
+    Examples
+    --------
+    >>> eg.datasets.path("corridor")  # doctest: +SKIP
     """
     entry = describe(name)
     return locate(entry, entry.file, entry.sources, base_url, entry.convert)
@@ -169,6 +185,11 @@ def load(
         As for `path`.
     FileFormatError
         If the file found is damaged, or marks nothing as clean.
+
+    Examples
+    --------
+    >>> eg.datasets.load("corridor")  # doctest: +SKIP
+    Tracks(11 views, 737 points, 4035 observations)
     """
     if describe(name).kind == "tracks":
         return load_tracks(path(name, base_url=base_url), clean=clean, views=views)

@@ -63,6 +63,11 @@ def load_image(path: PathLike) -> Image:
     The image is turned upright as its EXIF orientation says, so that width, height and pixel
     coordinates are those of the picture that a viewer shows, not of the pixels in the order of
     the file. (OpenCV before 5 does not see the orientation of a WebP file.)
+
+    Examples
+    --------
+    >>> eg.load_image("photo.jpg").shape  # doctest: +SKIP
+    (480, 640, 3)
     """
     cv2 = opencv()
     with Path(path).open("rb") as file:

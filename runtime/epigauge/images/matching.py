@@ -109,6 +109,11 @@ def match_images(
 
     SIFT and AKAZE place features where they are. OpenCV's ORB and BRISK place those of coarse
     scales up to a pixel too far to the upper left.
+
+    Examples
+    --------
+    >>> found = eg.match_images("A.jpg", "B.jpg")  # doctest: +SKIP
+    >>> eg.estimate_fundamental(found.x1, found.x2)  # doctest: +SKIP
     """
     as_choice("detector", detector, tuple(DETECTORS))
     ratio = as_positive("ratio", ratio)

@@ -180,6 +180,10 @@ def match_photographs(
     ----------
     .. [1] R. Arandjelovic, A. Zisserman, "Three things everyone should know to improve object
        retrieval", CVPR 2012.
+
+    Examples
+    --------
+    >>> eg.match_photographs(["room0.jpg", "room1.jpg", "room2.jpg"])  # doctest: +SKIP
     """
     paths = [Path(path) for path in images]
     if len(paths) < 2:

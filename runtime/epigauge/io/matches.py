@@ -39,6 +39,13 @@ class Matches(Result):
         What to call the pair: the file's name without its suffix.
     marked : int, optional
         How many of the matches the file marks as inliers; None where it marks none.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.two_view_scene(5.0, seed=1)
+    >>> len(eg.Matches(scene.x1, scene.x2))
+    50
     """
 
     x1: Array
@@ -173,6 +180,12 @@ def save_matches(path: PathLike, matches: Matches) -> None:
         If the suffix is none of these, or the matches are not usable as such.
     OSError
         If the file cannot be written.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.two_view_scene(5.0, seed=1)
+    >>> eg.save_matches("pair.csv", eg.Matches(scene.x1, scene.x2))  # doctest: +SKIP
     """
     suffix = check_suffix(path, ".csv", ".txt", ".npz")
     x1, x2 = as_matches(matches.x1, matches.x2, at_least=1)

@@ -93,6 +93,12 @@ def plain(value: Any) -> Any:
     ------
     TypeError
         On a type without such a form.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> plain({"x": np.array([1.0, np.nan])})
+    {'x': [1.0, None]}
     """
     if value is None or isinstance(value, str | bool | int):
         return value

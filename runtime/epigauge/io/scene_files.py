@@ -149,6 +149,11 @@ def save_scene(
     -----
     The rotation matrices are written as quaternions or Rodrigues vectors, which rounds them in the
     last digit; those that have not changed since `load_scene` are written as they were.
+
+    Examples
+    --------
+    >>> eg.save_scene("refined", tracks, result.reconstruction)  # doctest: +SKIP
+    >>> eg.save_scene("scene.glb", tracks, result.reconstruction)  # doctest: +SKIP
     """
     path = Path(path)
     content = scene_content(path, tracks, reconstruction, rigs)

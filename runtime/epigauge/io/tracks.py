@@ -106,6 +106,12 @@ def load_tracks(
         If the file does not hold tracks in this form, naming the line where there is one.
     OSError
         If the file cannot be read.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.load_tracks(eg.samples.path("tracks.csv"))
+    Tracks(5 views, 100 points, 500 observations)
     """
     return load_track_file(
         path, clean, views, prune=prune, with_start=False, image_size=image_size
@@ -233,6 +239,11 @@ def load_reconstruction(path: PathLike) -> Reconstruction:
         If the file does not hold them.
     OSError
         If the file cannot be read.
+
+    Examples
+    --------
+    >>> eg.load_reconstruction("result.npz").P.shape  # doctest: +SKIP
+    (11, 3, 4)
     """
     path = Path(path)
     start = _reconstruction(path, _read(path, with_start=True))
@@ -261,6 +272,10 @@ def save_tracks(path: PathLike, tracks: Tracks, start: Reconstruction | None = N
         If the suffix is none of these, or the form cannot hold what is given.
     OSError
         If the file cannot be written.
+
+    Examples
+    --------
+    >>> eg.save_tracks("tracks.csv", tracks)  # doctest: +SKIP
     """
     form = _form(path)
     if (start is None) != (form == ".csv") and form != ".npz":
@@ -297,6 +312,10 @@ def save_reconstruction(path: PathLike, reconstruction: Reconstruction) -> None:
         If the suffix is another one.
     OSError
         If the file cannot be written.
+
+    Examples
+    --------
+    >>> eg.save_reconstruction("scene.npz", result.reconstruction)  # doctest: +SKIP
     """
     check_suffix(path, ".npz")
     with writing(path) as file:

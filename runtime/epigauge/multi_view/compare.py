@@ -149,6 +149,14 @@ def compare(
     ------
     ArgumentError
         On unknown or repeated names, and as `bundle_adjust`.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> tracks = eg.multi_view_scene(seed=1).tracks
+    >>> table = eg.compare(tracks, ["covariant", "free"])
+    >>> [row.method for row in table.rows if row.success]
+    ['covariant', 'free']
     """
     known = known_options("compare", options, AdjustOptions)
     names: str | Sequence[str] = methods

@@ -90,6 +90,13 @@ def initialize(
     ----------
     .. [1] J. H. Hong, C. Zach, "pOSE: pseudo object space error for initialization-free bundle
        adjustment", CVPR 2018.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> tracks = eg.multi_view_scene(seed=1).tracks
+    >>> eg.initialize(tracks).rms_px(tracks) < 2.0
+    True
     """
     as_choice("method", method, ("auto", "registration", "factorization"))
     as_count("seed", seed, at_least=0)

@@ -101,6 +101,13 @@ class Reconstruction(ReconstructionBase):
         Cameras, to pixels.
     Q : ndarray, shape (m, 4)
         Homogeneous points.
+
+    Examples
+    --------
+    >>> import numpy as np, epigauge as eg
+    >>> scene = eg.Reconstruction(np.tile(np.eye(3, 4), (2, 1, 1)), np.ones((8, 4)))
+    >>> scene.P.shape
+    (2, 3, 4)
     """
 
     P: Array

@@ -82,6 +82,13 @@ class Tracks(Result):
         point seen in fewer than 2 views, a view with fewer than 6 points, tracks that fall
         into parts without a common point, and names, sizes or colours of another number; the
         message names rows. `Tracks.pruned` drops what is too weak instead.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.multi_view_scene(n_points=20, seed=1).tracks
+    >>> eg.Tracks(scene.view, scene.point, scene.xy, names=list("abcde")).names
+    ('a', 'b', 'c', 'd', 'e')
     """
 
     def __init__(

@@ -370,6 +370,15 @@ def covariance(
        of geometric structure with indeterminacy", IEEE Trans. Inf. Theory 47(5), 2001.
     .. [2] K. Takahashi, J. Fagan, M.-S. Chen, "Formation of a sparse bus impedance matrix and its
        application to short circuit study", Proc. 8th PICA Conf., 1973.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> tracks = eg.multi_view_scene(seed=1).tracks
+    >>> result = eg.bundle_adjust(tracks)
+    >>> found = eg.covariance(tracks, result.reconstruction, eg.gauge.normalized())
+    >>> found.points.shape
+    (100, 4, 4)
     """
     if isinstance(reconstruction, AffineReconstruction):
         if as_choice("loss", loss, LOSSES) != "linear":

@@ -61,6 +61,10 @@ def save_figure(figure: Figure, path: PathLike) -> None:
         If the suffix is neither of these.
     OSError
         If the file cannot be written.
+
+    Examples
+    --------
+    >>> save_figure(result.plot(x1, x2), "refined.png")  # doctest: +SKIP
     """
     suffix = check_suffix(path, ".png", ".svg")
     from matplotlib import rc_context

@@ -57,6 +57,10 @@ def plot_comparison(comparison: Comparison, title: str = "") -> Figure:
     ------
     MissingPackageError
         If Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> plot_comparison(eg.compare(tracks))  # doctest: +SKIP
     """
     figure = new_figure(_WIDTH, 5.6)
     heading(figure, "Convergence of the methods" + (f": {title}" if title else ""))

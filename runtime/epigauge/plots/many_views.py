@@ -57,6 +57,10 @@ def plot_bundle(
     ------
     MissingPackageError
         If Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> plot_bundle(result, tracks, "corridor")  # doctest: +SKIP
     """
     figure = new_figure(_WIDTH, 9.0)
     shown = display(result.reconstruction, tracks) if frame is None else frame

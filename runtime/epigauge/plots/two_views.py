@@ -65,6 +65,10 @@ def plot_refinement(
         If the matches, sizes or images cannot be used.
     MissingPackageError
         If Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> plot_refinement(result, x1, x2)  # doctest: +SKIP
     """
     points = as_matches(x1, x2, at_least=1)
     F = np.asarray(result.F, dtype=np.float64)

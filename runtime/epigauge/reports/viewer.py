@@ -73,6 +73,10 @@ def save_viewer(
         If the suffix is another one.
     OSError
         If the file cannot be written.
+
+    Examples
+    --------
+    >>> save_viewer("scene.html", result, tracks)  # doctest: +SKIP
     """
     check_suffix(path, ".html")
     shown = display(result.reconstruction, tracks) if frame is None else frame

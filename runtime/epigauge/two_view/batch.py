@@ -159,6 +159,14 @@ def refine_fundamental_batch(
     ArgumentError
         On bad shapes, NaN or infinity, offsets that do not partition the matches, and unknown
         options.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.two_view_scene(5.0, seed=1)
+    >>> batch = eg.refine_fundamental_batch(scene.x1, scene.x2, [0, 20, 50])
+    >>> batch.F.shape, bool(batch.success.all())
+    ((2, 3, 3), True)
     """
     known = known_options("refine_fundamental_batch", options, PairOptions)
     if arrays.is_tensor(x1) or known.get("backend") == "array":

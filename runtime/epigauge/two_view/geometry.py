@@ -40,6 +40,14 @@ def canonical_cameras(F: ArrayLike) -> tuple[Array, Array]:
     ----------
     .. [BS04] A. Bartoli, P. Sturm, "Nonlinear estimation of the fundamental matrix with minimal
        parameters", PAMI 26(3), 2004, eqs. (4), (5).
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.two_view_scene(5.0, seed=1)
+    >>> P1, P2 = eg.canonical_cameras(eg.fundamental_8point(scene.x1, scene.x2))
+    >>> P1.shape, P2.shape
+    ((3, 4), (3, 4))
     """
     factors = factorize(_rank_two("F", as_fundamental(F, "F")))
     return np.eye(3, 4), np.asarray(kernels.table().canonical_camera(*factors))
@@ -80,6 +88,15 @@ def reprojection_distances(
     References
     ----------
     .. [1] R. Hartley, P. Sturm, "Triangulation", CVIU 68(2), 1997.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.two_view_scene(5.0, seed=1)
+    >>> F = eg.fundamental_8point(scene.x1, scene.x2)
+    >>> d, x1_hat, x2_hat = eg.reprojection_distances(F, scene.x1, scene.x2)
+    >>> d.shape, x1_hat.shape
+    ((50,), (50, 2))
     """
     x1, x2 = as_matches(x1, x2, at_least=0)
     frame, F_inside, q1, q2 = _conditioned(F, x1, x2)
@@ -111,6 +128,14 @@ def sampson_distances(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> Array:
     ------
     ArgumentError
         On bad shapes, NaN or infinity, or an F without a rank of 2.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.two_view_scene(5.0, seed=1)
+    >>> F = eg.fundamental_8point(scene.x1, scene.x2)
+    >>> eg.sampson_distances(F, scene.x1, scene.x2).shape
+    (50,)
     """
     x1, x2 = as_matches(x1, x2, at_least=0)
     frame, F_inside, q1, q2 = _conditioned(F, x1, x2)
@@ -151,6 +176,14 @@ def triangulate(P: ArrayLike, x: ArrayLike) -> Array:
     Notes
     -----
     The matches are corrected to their foot points, whose rays meet exactly.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.two_view_scene(5.0, seed=1)
+    >>> P = eg.canonical_cameras(eg.fundamental_8point(scene.x1, scene.x2))
+    >>> eg.triangulate(P, [scene.x1, scene.x2]).shape
+    (50, 4)
     """
     cameras = as_real("P", P, "two finite cameras, (2, 3, 4)")
     if cameras.shape != (2, 3, 4):

@@ -42,6 +42,13 @@ def fundamental_8point(x1: ArrayLike, x2: ArrayLike) -> Array:
     References
     ----------
     .. [1] R. Hartley, "In Defence of the 8-Point Algorithm", ICCV 1995.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.two_view_scene(5.0, seed=1)
+    >>> eg.fundamental_8point(scene.x1, scene.x2).shape
+    (3, 3)
     """
     x1, x2 = as_matches(x1, x2, general_position=True)
     n1, T1 = _normalize(x1)
@@ -80,6 +87,13 @@ def fundamental_7point(x1: ArrayLike, x2: ArrayLike) -> Array:
     References
     ----------
     .. [1] R. Hartley, A. Zisserman, "Multiple View Geometry", 2003, section 11.1.2.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.two_view_scene(5.0, seed=1)
+    >>> eg.fundamental_7point(scene.x1[:7], scene.x2[:7]).shape[1:]
+    (3, 3)
     """
     x1, x2 = as_matches(x1, x2, at_least=7, general_position=True)
     if len(x1) != 7:

@@ -195,6 +195,14 @@ def refine_fundamental(
     ----------
     .. [BS04] A. Bartoli, P. Sturm, "Nonlinear estimation of the fundamental matrix with minimal
        parameters", PAMI 26(3), 2004.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.two_view_scene(5.0, seed=1)
+    >>> result = eg.refine_fundamental(scene.x1, scene.x2)
+    >>> result.F.shape, result.success, result.rank
+    ((3, 3), True, 7)
     """
     plan = _plan(
         *(parameterization, criterion, structure, damping, hessian, loss, loss_scale_px),

@@ -29,6 +29,15 @@ def equivalent(a: Reconstruction, b: Reconstruction, tol: float = 1e-8) -> bool:
     -------
     bool
         True where some T, gamma, alpha take a to b.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> tracks = eg.multi_view_scene(seed=1).tracks
+    >>> a = eg.initialize(tracks)
+    >>> b = eg.gauge.transform(a, 2.0 * np.eye(4) + np.eye(4, k=1))
+    >>> eg.gauge.equivalent(a, b)
+    True
     """
     if a.P.shape != b.P.shape or a.Q.shape != b.Q.shape:
         return False

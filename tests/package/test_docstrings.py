@@ -1,0 +1,56 @@
+"""Docstrings of public names: their examples run, and those of the package itself all have one."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import inspect
+from collections.abc import Iterator
+from typing import Any
+
+import epigauge as eg
+import numpy as np
+import pytest
+
+MODULES = (
+    *("casadi", "colmap", "datasets", "gauge", "images", "interop", "io", "kernels"),
+    *("plots", "reports", "samples", "verdicts"),
+)
+
+
+def public() -> Iterator[tuple[str, Any]]:
+    """Yield the names that users write, and what they stand for."""
+    for name in eg.__all__:
+        yield name, getattr(eg, name)
+    for module in MODULES:
+        found = getattr(eg, module, None) or importlib.import_module(f"epigauge.{module}")
+        for name in found.__all__:
+            yield f"{module}.{name}", getattr(found, name)
+
+
+NAMED = {
+    name: value
+    for name, value in public()
+    if inspect.isfunction(value) or (inspect.isclass(value) and value.__module__ != "builtins")
+}
+
+
+@pytest.mark.parametrize("name", [n for n, v in NAMED.items() if ">>>" in (v.__doc__ or "")])
+def test_examples_run_and_print_what_they_show(name: str) -> None:
+    value = NAMED[name]
+    module = importlib.import_module(inspect.unwrap(value).__module__)
+    parsed = doctest.DocTestParser().get_doctest(
+        value.__doc__ or "", vars(module) | {"eg": eg, "np": np}, name, None, 0
+    )
+    printed: list[str] = []
+    runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE)
+    failed = runner.run(parsed, out=printed.append).failed
+    text = "".join(printed)
+    if "MissingPackageError" in text or "ModuleNotFoundError" in text:
+        pytest.skip("needs a package that is not installed")
+    assert failed == 0, text
+
+
+def test_functions_of_the_package_have_an_example() -> None:
+    functions = {n: v for n, v in NAMED.items() if inspect.isfunction(v) and "." not in n}
+    assert [name for name, value in functions.items() if ">>>" not in (value.__doc__ or "")] == []
