@@ -362,3 +362,32 @@ def test_points_far_away_do_not_spoil_a_datum_of_near_ones() -> None:
     # Far points tell of the rotations, and nothing but that.
     assert (b.std.points[:25] <= a.std.points * (1.0 + 1e-6)).all()
     assert (b.std.points[:25] >= 0.3 * a.std.points).all()
+
+
+def test_a_network_with_control_points_agrees_with_dense_algebra() -> None:
+    """As the report of a network: sigma0, redundancy, intrinsics, positions and points."""
+    tracks, scene = metric_scene(
+        "brown", 12, n_views=7, n_points=40, n_cameras=1, visible=0.8, noise_px=0.4
+    )
+    rng = np.random.default_rng(3)
+    sigma = rng.choice([0.3, 0.5, 2.0], (len(tracks), 2))
+    tracks = eg.Tracks(tracks.view, tracks.point, tracks.xy, sigma=sigma)
+    names, control = ("c", "x0", "y0", "B1"), [0, 7, 19, 31]
+    options: dict[str, Any] = {"refine": names, "fixed_points": control}
+    result = eg.bundle_adjust(tracks, scene, ftol=1e-15, **options)
+    found = result.reconstruction
+    np.testing.assert_array_equal(found.X[control], scene.X[control])
+    dense = Dense(found, names)
+    J = dense.jacobian(lambda s: s.project(tracks).ravel()) / sigma.reshape(-1, 1)
+    r = (result.fun / sigma).ravel()
+    held = np.zeros((dense.size, 3 * len(control)))
+    for k, j in enumerate(control):
+        held[dense.point(j), 3 * k : 3 * k + 3] = np.eye(3)
+    redundancy = len(r) - (dense.size - held.shape[1])
+    free = ~held.any(axis=1)
+    assert np.abs(J.T @ r)[free].max() < 1e-4 * np.abs(J).max()
+    cov = eg.covariance(tracks, found, **options)
+    assert (cov.redundancy, cov.open) == (redundancy, 0)
+    sigma0 = float(np.sqrt(r @ r / redundancy))
+    assert cov.noise_px == pytest.approx(sigma0 * tracks.unit, rel=1e-9)
+    assert_same(cov, dense, sigma0**2 * dense.covariance(J.T @ J, held), 1e-5)

@@ -42,7 +42,7 @@ def test_an_estimate_is_moved_to_where_it_agrees_in_the_datum() -> None:
 def test_coverage_has_a_row_a_model_datum_and_part() -> None:
     section = metrology.coverage(Experiments(2))
     table = next(item for item in section.content if isinstance(item, Table))
-    assert len(table.rows) == 3 * 3 * 3
+    assert len(table.rows) == 3 * 3 * 3 + 3 * 2 + 1
     assert all(0.0 <= row[3] <= 100.0 and row[4] > 0.0 for row in table.rows)
 
 
