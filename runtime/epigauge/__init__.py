@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge import casadi, colmap, datasets, interop, kernels, samples, verdicts
-    from epigauge.bundle.priors import (
+    from epigauge.bundle.prior_kinds import (
         Distance,
         IntrinsicPrior,
         PointPrior,
@@ -142,7 +142,7 @@ __all__ = [
 
 #: Modules below this package, and the public names that they define.
 _WHERE = {
-    "bundle.priors": "Distance IntrinsicPrior PointPrior PositionPrior RotationPrior",
+    "bundle.prior_kinds": "Distance IntrinsicPrior PointPrior PositionPrior RotationPrior",
     "cameras": "AffineReconstruction Cameras MetricReconstruction",
     "errors": "ArgumentError BackendError EpigaugeError FileFormatError",
     "images": "ImageMatches load_image match_images",

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.bundle.freedom import Freedom
-from epigauge.bundle.priors import Prior, Priors, listed_priors
+from epigauge.bundle.prior_kinds import Prior, listed_priors
+from epigauge.bundle.priors import Priors
 from epigauge.bundle.refinement import fixed_indices, refined_freedom, whole_freedom
 from epigauge.cameras import (
     AffineReconstruction,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.bundle.freedom import Freedom
-from epigauge.bundle.priors import (
+from epigauge.bundle.prior_kinds import (
     Distance,
     IntrinsicPrior,
     PointPrior,

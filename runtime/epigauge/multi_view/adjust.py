@@ -19,7 +19,7 @@ from epigauge._results import Result
 from epigauge.bundle.dampings import DAMPINGS
 from epigauge.bundle.jobs import job_of
 from epigauge.bundle.observations import ObservationGraph
-from epigauge.bundle.priors import Prior, listed_priors
+from epigauge.bundle.prior_kinds import Prior, listed_priors
 from epigauge.bundle.refinement import fixed_indices
 from epigauge.bundle.run import checked_gauge, minimized
 from epigauge.bundle.strategies import STRATEGIES

@@ -22,7 +22,7 @@ from epigauge._arguments import as_choice, as_positive
 from epigauge._results import Result
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.bundle.observations import ObservationGraph
-from epigauge.bundle.priors import Prior
+from epigauge.bundle.prior_kinds import Prior
 from epigauge.cameras import (
     AffineReconstruction,
     AnyReconstruction,

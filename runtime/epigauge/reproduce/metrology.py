@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.bundle.priors import Distance
+from epigauge.bundle.prior_kinds import Distance
 from epigauge.cameras import Cameras, MetricReconstruction, camera_model
 from epigauge.multi_view.adjust import bundle_adjust
 from epigauge.multi_view.gauge import (

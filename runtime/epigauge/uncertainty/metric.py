@@ -14,7 +14,7 @@ from epigauge.bundle.jobs import Job, metric_job
 from epigauge.bundle.moves import best_conditioned
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.bundle.observations import ObservationGraph
-from epigauge.bundle.priors import Prior
+from epigauge.bundle.prior_kinds import Prior
 from epigauge.bundle.problem import Estimate
 from epigauge.bundle.run import bundle_problem
 from epigauge.bundle.similarity import Similarity
