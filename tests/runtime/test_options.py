@@ -12,7 +12,7 @@ from epigauge import _options, kernels
 from epigauge.bundle.dampings import DAMPINGS
 from epigauge.bundle.strategies import STRATEGIES
 from epigauge.images import DETECTORS
-from epigauge.two_view import losses, parameterizations, robust, solve
+from epigauge.two_view import front_ends, losses, parameterizations, solve
 from epigauge.two_view.criteria import CRITERIA
 from epigauge.two_view.parameterizations import Ortho
 
@@ -27,7 +27,7 @@ NAMES = {
     "Criterion": CRITERIA,
     "PairDamping": solve.DAMPINGS,
     "Part": Ortho.parts,
-    "FrontEnd": ("auto", *robust._FRONT_ENDS),
+    "FrontEnd": ("auto", "native", *front_ends._PACKAGES),
     "Method": STRATEGIES,
     "BundleDamping": DAMPINGS,
     "Detector": DETECTORS,
