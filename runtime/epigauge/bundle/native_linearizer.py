@@ -118,6 +118,17 @@ class NativeLinearizer:
         others = max(len(self._passes), len(self._pairs)) - 1
         self._pool = ThreadPoolExecutor(others) if others else None
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what it was made from: addresses and threads mean nothing elsewhere."""
+        workers = max(len(self._passes), len(self._pairs))
+        own = self.model, self.graph, self.q, self.weights, self.loss
+        return NativeLinearizer, (*own, workers, self._used, self.factored)
+
+    def __copy__(self) -> NativeLinearizer:
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        return other
+
     @property
     def edges(self) -> tuple[Indices, Indices]:
         """Return where the threads' ranges of chunks end, for passes and for those over pairs."""

@@ -39,6 +39,10 @@ class Skyline:
     first: NDArray[np.int32]
     slot: Indices
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the arrays: addresses in memory mean nothing elsewhere."""
+        return Skyline, (self.first, self.slot)
+
     @staticmethod
     def of(first: NDArray[Any]) -> Skyline:
         """Return the skyline with these first columns."""
