@@ -61,7 +61,12 @@ def _classes_of_results():
                     yield rf"\.{name}$"
 
 
-numpydoc_validation_exclude = {*_classes_of_results(), r"\.Gauge$", r"\.ImageMatches$"}
+numpydoc_validation_exclude = {
+    *_classes_of_results(),
+    r"\.Gauge$",
+    r"\.ImageMatches$",
+    r"\.NoTracks$",
+}
 
 html_theme = "pydata_sphinx_theme"
 html_title = f"epigauge {release}"

@@ -143,7 +143,7 @@ def compare(
     Returns
     -------
     Comparison
-        Rows of plain data; `to_markdown()`, `plot()`.
+        Rows of plain data; `Comparison.to_markdown`, `Comparison.plot`.
 
     Raises
     ------
