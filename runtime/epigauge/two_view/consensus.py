@@ -132,10 +132,8 @@ class Consensus:
         Scores are to be compared for one extent only. A small one sees no more of the wrong matches
         than how dense they are beside the epipolar lines.
         """
-        signed = self.criterion.evaluate(F).signed
-        # A match without a distance (beside a degenerate F) agrees with nothing.
+        signed, oriented = self.measured(F)
         there = np.abs(signed) < 1.0 / _FLOOR
-        oriented = self.oriented(F) & there
         near = np.abs(signed) <= extent if extent < RANGE else np.ones(len(signed), np.bool_)
         squared, counts = np.where(there, signed, 0.0)[near] ** 2, oriented[near]
         best = None
@@ -154,6 +152,12 @@ class Consensus:
             # The seven parameters of F absorb seven squares of the noise
             variance = np.sum(right * squared) / max(count - 7.0, 1.0)
             sigma = min(max(float(np.sqrt(variance)), _FLOOR), self.widest)
+
+    def measured(self, F: Array) -> tuple[Array, Mask]:
+        """Return exact distances, and which matches can lie in front of both cameras."""
+        signed = self.criterion.evaluate(F).signed
+        # A match without a distance (beside a degenerate F) agrees with nothing.
+        return signed, self.oriented(F) & (np.abs(signed) < 1.0 / _FLOOR)
 
     def climb(self, start: Agreement) -> Agreement:
         """Maximise the likelihood over F, sigma and share in turns."""

@@ -123,13 +123,14 @@ def _native(
         found = search(kernels, q1, q2, order, seed=seed + turn, scale=scale)
         if not found.score > 0.0:
             continue
-        own = consensus.judge(found.F, scale)
-        sharp = consensus.judge(found.F, scale, extent=_EXTENT * scale)
-        if sharp.sigma <= 2.0 * scale and _is_sharp(
-            kernels, q1, q2, sharp, np.abs(own.signed[few]), _DEVIATIONS * scale
-        ):
-            return sharp
-        agreements.append(own)
+        if q1.shape[1] >= _MANY:
+            sharp = consensus.judge(found.F, scale, extent=_EXTENT * scale)
+            d = np.abs(sharp.signed[few])
+            if sharp.sigma <= 2.0 * scale and _is_sharp(
+                kernels, q1, q2, sharp, d, _DEVIATIONS * scale
+            ):
+                return sharp
+        agreements.append(consensus.judge(found.F, scale))
     if not agreements:
         return None
     # A few matches fit exactly by chance: of so many samples, and in any of them seven do.
@@ -146,7 +147,7 @@ def _is_sharp(
         np.count_nonzero(d <= bound) - 7
         for bound in (max(_DEVIATIONS * found.sigma, 1e-9), limit, 4.0 * limit)
     )
-    if len(d) < _MANY or hits <= _SHARP * around or core <= 0.5 * hits:
+    if hits <= _SHARP * around or core <= 0.5 * hits:
         return False
     chance = chance_agreement(kernels, found.F, q1, q2, limit)
     return log10_false_alarms(q1.shape[1], int(hits) + 7, chance) <= SIGNIFICANT

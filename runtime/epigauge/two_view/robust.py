@@ -215,7 +215,8 @@ def _estimated(
         F0 = frame.to_pixels(agreement.F)
         refined = refine_fundamental(y1[used], y2[used], F0, **chosen)
         F = frame.from_pixels(refined.F)
-        agreement = consensus.judge(F, agreement.sigma, agreement.share, agreement.extent)
+        signed, oriented = consensus.measured(F)
+        agreement = replace(agreement, F=F, signed=signed, oriented=oriented)
         if threshold is None:
             sigma = robust_scale(agreement.signed[used])
             limit = min(limit, max(_DEVIATIONS * sigma, 1e-9))
