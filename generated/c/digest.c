@@ -7,7 +7,7 @@
 
 const char *eg_digest(void)
 {
-    return "4e0a25f62cb837a8";
+    return "b80f2f2922ff7611";
 }
 
 const char *eg_sources(void)

@@ -1147,8 +1147,8 @@ EG_EXPORT void eg_maps(
 
 EG_EXPORT void eg_seven_points(
     ptrdiff_t n,
-    const double *EG_RESTRICT q1,
-    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT sample1,
+    const double *EG_RESTRICT sample2,
     double *EG_RESTRICT F,
     double *EG_RESTRICT votes,
     double *EG_RESTRICT discriminant);

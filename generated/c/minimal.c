@@ -8,13 +8,13 @@
    11.1.2): the roots of det(F1 + a F2) = 0, the first always real, the others where the
    discriminant is positive. Votes are 7 or -7 where all matches have one sign of (e' x q') .
    (F q), the oriented epipolar constraint.
-   Inputs:  q1 (2, 7), q2 (2, 7)
+   Inputs:  sample1 (2, 7), sample2 (2, 7)
    Outputs: F (3, 3, 3), votes (3,), discriminant ()
    Operations: 1260, temporaries: 245. */
 EG_EXPORT void eg_seven_points(
     ptrdiff_t n,
-    const double *EG_RESTRICT q1,
-    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT sample1,
+    const double *EG_RESTRICT sample2,
     double *EG_RESTRICT F,
     double *EG_RESTRICT votes,
     double *EG_RESTRICT discriminant)
@@ -189,19 +189,19 @@ EG_EXPORT void eg_seven_points(
         double kept_whole[16];
         EG_SIMD
         for (ptrdiff_t i = begin; i < end; ++i) {
-            const double q1_00 = q1[i];
-            const double q1_01 = q1[n + i];
-            const double q1_02 = q1[2*n + i];
-            const double q1_10 = q1[7*n + i];
-            const double q1_11 = q1[8*n + i];
-            const double q1_12 = q1[9*n + i];
-            double t0 = q1_01 - q1_00;
+            const double sample1_00 = sample1[i];
+            const double sample1_01 = sample1[n + i];
+            const double sample1_02 = sample1[2*n + i];
+            const double sample1_10 = sample1[7*n + i];
+            const double sample1_11 = sample1[8*n + i];
+            const double sample1_12 = sample1[9*n + i];
+            double t0 = sample1_01 - sample1_00;
             double a1 = t0;
-            double t1 = q1_02 - q1_00;
+            double t1 = sample1_02 - sample1_00;
             double b1 = t1;
-            double t2 = q1_11 - q1_10;
+            double t2 = sample1_11 - sample1_10;
             double c1 = t2;
-            double t3 = q1_12 - q1_10;
+            double t3 = sample1_12 - sample1_10;
             double d1 = t3;
             double area1 = t0*t3 - t1*t2;
             kept_a1[i - begin] = a1;
@@ -229,34 +229,34 @@ EG_EXPORT void eg_seven_points(
         }
         EG_SIMD
         for (ptrdiff_t i = begin; i < end; ++i) {
-            const double q1_00 = q1[i];
-            const double q1_03 = q1[3*n + i];
-            const double q1_04 = q1[4*n + i];
-            const double q1_05 = q1[5*n + i];
-            const double q1_06 = q1[6*n + i];
-            const double q1_10 = q1[7*n + i];
-            const double q1_13 = q1[10*n + i];
-            const double q1_14 = q1[11*n + i];
-            const double q1_15 = q1[12*n + i];
-            const double q1_16 = q1[13*n + i];
+            const double sample1_00 = sample1[i];
+            const double sample1_03 = sample1[3*n + i];
+            const double sample1_04 = sample1[4*n + i];
+            const double sample1_05 = sample1[5*n + i];
+            const double sample1_06 = sample1[6*n + i];
+            const double sample1_10 = sample1[7*n + i];
+            const double sample1_13 = sample1[10*n + i];
+            const double sample1_14 = sample1[11*n + i];
+            const double sample1_15 = sample1[12*n + i];
+            const double sample1_16 = sample1[13*n + i];
             double i1_0 = kept_i1_0[i - begin];
             double i1_1 = kept_i1_1[i - begin];
             double i1_2 = kept_i1_2[i - begin];
             double i1_3 = kept_i1_3[i - begin];
-            double t5 = q1_03 - q1_00;
-            double t6 = q1_13 - q1_10;
+            double t5 = sample1_03 - sample1_00;
+            double t6 = sample1_13 - sample1_10;
             double u1_3 = i1_0*t5 + i1_1*t6;
             double v1_3 = i1_2*t5 + i1_3*t6;
-            double t7 = q1_04 - q1_00;
-            double t8 = q1_14 - q1_10;
+            double t7 = sample1_04 - sample1_00;
+            double t8 = sample1_14 - sample1_10;
             double u1_4 = i1_0*t7 + i1_1*t8;
             double v1_4 = i1_2*t7 + i1_3*t8;
-            double t10 = q1_15 - q1_10;
-            double t9 = q1_05 - q1_00;
+            double t10 = sample1_15 - sample1_10;
+            double t9 = sample1_05 - sample1_00;
             double u1_5 = i1_0*t9 + i1_1*t10;
             double v1_5 = i1_2*t9 + i1_3*t10;
-            double t11 = q1_06 - q1_00;
-            double t12 = q1_16 - q1_10;
+            double t11 = sample1_06 - sample1_00;
+            double t12 = sample1_16 - sample1_10;
             double u1_6 = i1_0*t11 + i1_1*t12;
             double v1_6 = i1_2*t11 + i1_3*t12;
             kept_u1_3[i - begin] = u1_3;
@@ -270,19 +270,19 @@ EG_EXPORT void eg_seven_points(
         }
         EG_SIMD
         for (ptrdiff_t i = begin; i < end; ++i) {
-            const double q2_00 = q2[i];
-            const double q2_01 = q2[n + i];
-            const double q2_02 = q2[2*n + i];
-            const double q2_10 = q2[7*n + i];
-            const double q2_11 = q2[8*n + i];
-            const double q2_12 = q2[9*n + i];
-            double t13 = q2_01 - q2_00;
+            const double sample2_00 = sample2[i];
+            const double sample2_01 = sample2[n + i];
+            const double sample2_02 = sample2[2*n + i];
+            const double sample2_10 = sample2[7*n + i];
+            const double sample2_11 = sample2[8*n + i];
+            const double sample2_12 = sample2[9*n + i];
+            double t13 = sample2_01 - sample2_00;
             double a2 = t13;
-            double t14 = q2_02 - q2_00;
+            double t14 = sample2_02 - sample2_00;
             double b2 = t14;
-            double t15 = q2_11 - q2_10;
+            double t15 = sample2_11 - sample2_10;
             double c2 = t15;
-            double t16 = q2_12 - q2_10;
+            double t16 = sample2_12 - sample2_10;
             double d2 = t16;
             double area2 = t13*t16 - t14*t15;
             kept_a2[i - begin] = a2;
@@ -310,34 +310,34 @@ EG_EXPORT void eg_seven_points(
         }
         EG_SIMD
         for (ptrdiff_t i = begin; i < end; ++i) {
-            const double q2_00 = q2[i];
-            const double q2_03 = q2[3*n + i];
-            const double q2_04 = q2[4*n + i];
-            const double q2_05 = q2[5*n + i];
-            const double q2_06 = q2[6*n + i];
-            const double q2_10 = q2[7*n + i];
-            const double q2_13 = q2[10*n + i];
-            const double q2_14 = q2[11*n + i];
-            const double q2_15 = q2[12*n + i];
-            const double q2_16 = q2[13*n + i];
+            const double sample2_00 = sample2[i];
+            const double sample2_03 = sample2[3*n + i];
+            const double sample2_04 = sample2[4*n + i];
+            const double sample2_05 = sample2[5*n + i];
+            const double sample2_06 = sample2[6*n + i];
+            const double sample2_10 = sample2[7*n + i];
+            const double sample2_13 = sample2[10*n + i];
+            const double sample2_14 = sample2[11*n + i];
+            const double sample2_15 = sample2[12*n + i];
+            const double sample2_16 = sample2[13*n + i];
             double i2_0 = kept_i2_0[i - begin];
             double i2_1 = kept_i2_1[i - begin];
             double i2_2 = kept_i2_2[i - begin];
             double i2_3 = kept_i2_3[i - begin];
-            double t18 = q2_03 - q2_00;
-            double t19 = q2_13 - q2_10;
+            double t18 = sample2_03 - sample2_00;
+            double t19 = sample2_13 - sample2_10;
             double u2_3 = i2_0*t18 + i2_1*t19;
             double v2_3 = i2_2*t18 + i2_3*t19;
-            double t20 = q2_04 - q2_00;
-            double t21 = q2_14 - q2_10;
+            double t20 = sample2_04 - sample2_00;
+            double t21 = sample2_14 - sample2_10;
             double u2_4 = i2_0*t20 + i2_1*t21;
             double v2_4 = i2_2*t20 + i2_3*t21;
-            double t22 = q2_05 - q2_00;
-            double t23 = q2_15 - q2_10;
+            double t22 = sample2_05 - sample2_00;
+            double t23 = sample2_15 - sample2_10;
             double u2_5 = i2_0*t22 + i2_1*t23;
             double v2_5 = i2_2*t22 + i2_3*t23;
-            double t24 = q2_06 - q2_00;
-            double t25 = q2_16 - q2_10;
+            double t24 = sample2_06 - sample2_00;
+            double t25 = sample2_16 - sample2_10;
             double u2_6 = i2_0*t24 + i2_1*t25;
             double v2_6 = i2_2*t24 + i2_3*t25;
             kept_u2_3[i - begin] = u2_3;
@@ -981,10 +981,10 @@ EG_EXPORT void eg_seven_points(
         }
         EG_SIMD
         for (ptrdiff_t i = begin; i < end; ++i) {
-            const double q1_00 = q1[i];
-            const double q1_10 = q1[7*n + i];
-            const double q2_00 = q2[i];
-            const double q2_10 = q2[7*n + i];
+            const double sample1_00 = sample1[i];
+            const double sample1_10 = sample1[7*n + i];
+            const double sample2_00 = sample2[i];
+            const double sample2_10 = sample2[7*n + i];
             double e0_0 = kept_e0_0[i - begin];
             double e0_1 = kept_e0_1[i - begin];
             double e0_2 = kept_e0_2[i - begin];
@@ -1051,12 +1051,12 @@ EG_EXPORT void eg_seven_points(
             double v2_6 = kept_v2_6[i - begin];
             double t46 = f0_0*i2_0 + f0_3*i2_2;
             double t47 = f0_1*i2_0 + f0_4*i2_2;
-            double t48 = -i1_0*q1_00 - i1_1*q1_10;
-            double t49 = -i1_2*q1_00 - i1_3*q1_10;
+            double t48 = -i1_0*sample1_00 - i1_1*sample1_10;
+            double t49 = -i1_2*sample1_00 - i1_3*sample1_10;
             double t50 = f0_0*i2_1 + f0_3*i2_3;
             double t51 = f0_1*i2_1 + f0_4*i2_3;
-            double t52 = -i2_0*q2_00 - i2_1*q2_10;
-            double t53 = -i2_2*q2_00 - i2_3*q2_10;
+            double t52 = -i2_0*sample2_00 - i2_1*sample2_10;
+            double t53 = -i2_2*sample2_00 - i2_3*sample2_10;
             double t54 = f0_6 + f0_0*t52 + f0_3*t53;
             double t55 = f0_7 + f0_1*t52 + f0_4*t53;
             double t56 = f1_0*i2_0 + f1_3*i2_2;

@@ -973,7 +973,7 @@ SIGNATURES = {
     ),
     "seven_points": Signature(
         "minimal",
-        (Argument("q1", (2, 7), True), Argument("q2", (2, 7), True), ),
+        (Argument("sample1", (2, 7), True), Argument("sample2", (2, 7), True), ),
         (Argument("F", (3, 3, 3), True), Argument("votes", (3,), True), Argument("discriminant", (), True), ),
         "F of seven matches (R. Hartley, A. Zisserman, Multiple View Geometry, 2003, 11.1.2): the roots of det(F1 + a F2) = 0, the first always real, the others where the discriminant is positive. Votes are 7 or -7 where all matches have one sign of (e' x q') . (F q), the oriented epipolar constraint.",
     ),

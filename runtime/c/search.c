@@ -200,14 +200,15 @@ static double needed(search_t *s)
 }
 
 /* Improve the best proposal of a batch, where none before scored as high. Some of the matches judge
-   all proposals, all matches those that do best. */
-static int improved(search_t *s, ptrdiff_t n, const double *proposals, double *highest)
+   all proposals, all matches the finalists that do best. */
+static int improved(search_t *s, ptrdiff_t n, ptrdiff_t finalists, const double *proposals,
+                    double *highest)
 {
     double first[3 * BATCH];
     const double *best = NULL;
     for (ptrdiff_t k = 0; k < n; ++k)
         first[k] = agreement(s, s->judges, s->some, proposals + 9 * k);
-    for (int trial = 0; trial < FINALISTS && trial < n; ++trial) {
+    for (ptrdiff_t trial = 0; trial < finalists && trial < n; ++trial) {
         ptrdiff_t next = 0;
         for (ptrdiff_t k = 1; k < n; ++k)
             if (first[k] > first[next])
@@ -254,7 +255,7 @@ static void seven_points(search_t *s, const ptrdiff_t *order, ptrdiff_t *samples
                     proposals[9 * n + j] = F[BATCH * (9 * k + j) + i];
                 n += normalized(proposals + 9 * n);
             }
-        if (improved(s, n, proposals, &highest))
+        if (improved(s, n, FINALISTS, proposals, &highest))
             most = fmin(fmax(needed(s), (double)s->options->least), (double)s->options->samples);
     }
     *samples = done;
@@ -360,7 +361,8 @@ static void plane_and_parallax(search_t *s)
             }
             count += normalized(F);
         }
-        improved(s, count, proposals, &highest);
+        /* Matches on the plane, as most judges are, say nothing. */
+        improved(s, count, count, proposals, &highest);
     }
     free(rows);
 }

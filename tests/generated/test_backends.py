@@ -150,10 +150,12 @@ def test_c_is_numpy(name):
 @pytest.mark.parametrize("name", SIGNATURES)
 def test_casadi_is_numpy(name):
     # CasADi rewrites expressions (x*x as a square, sums in another order), so that each value is
-    # rounded differently; up to a thousand operations, and cancellation, leave 1e-12.
+    # rounded differently; up to a thousand operations, and cancellation, leave 1e-12; the condition
+    # of seven random matches costs some more.
+    tolerance = 1e-9 if name == "seven_points" else 1e-12
     for seed, batch in enumerate(BATCHES):
         if legal(name, batch):
-            compare(name, backend("casadi"), inputs(name, batch, seed), 1e-12)
+            compare(name, backend("casadi"), inputs(name, batch, seed), tolerance)
 
 
 @pytest.mark.parametrize("name", SIGNATURES)

@@ -12,7 +12,7 @@ import sympy as sp
 
 from epigauge_derive.kernel import Input, Kernel, Let, Loop, Output, select
 
-Q1, Q2 = Input("q1", (2, 7)), Input("q2", (2, 7))
+Q1, Q2 = Input("sample1", (2, 7)), Input("sample2", (2, 7))
 
 #: Columns of the four equations: those of the entries that are solved for, and of the two free
 #: ones. The latter vanish together only where the first match lies on the epipole.

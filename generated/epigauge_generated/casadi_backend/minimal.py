@@ -10,46 +10,46 @@ def seven_points():
     # 11.1.2): the roots of det(F1 + a F2) = 0, the first always real, the others where the
     # discriminant is positive. Votes are 7 or -7 where all matches have one sign of (e' x q') .
     # (F q), the oriented epipolar constraint.
-    # Inputs:  q1 (2, 7), q2 (2, 7)
+    # Inputs:  sample1 (2, 7), sample2 (2, 7)
     # Outputs: F (3, 3, 3), votes (3,), discriminant ()
     # Operations: 1260, temporaries: 245.
-    q1 = ca.SX.sym("q1", 2, 7)
-    q1_00 = q1[0, 0]
-    q1_01 = q1[0, 1]
-    q1_02 = q1[0, 2]
-    q1_03 = q1[0, 3]
-    q1_04 = q1[0, 4]
-    q1_05 = q1[0, 5]
-    q1_06 = q1[0, 6]
-    q1_10 = q1[1, 0]
-    q1_11 = q1[1, 1]
-    q1_12 = q1[1, 2]
-    q1_13 = q1[1, 3]
-    q1_14 = q1[1, 4]
-    q1_15 = q1[1, 5]
-    q1_16 = q1[1, 6]
-    q2 = ca.SX.sym("q2", 2, 7)
-    q2_00 = q2[0, 0]
-    q2_01 = q2[0, 1]
-    q2_02 = q2[0, 2]
-    q2_03 = q2[0, 3]
-    q2_04 = q2[0, 4]
-    q2_05 = q2[0, 5]
-    q2_06 = q2[0, 6]
-    q2_10 = q2[1, 0]
-    q2_11 = q2[1, 1]
-    q2_12 = q2[1, 2]
-    q2_13 = q2[1, 3]
-    q2_14 = q2[1, 4]
-    q2_15 = q2[1, 5]
-    q2_16 = q2[1, 6]
-    t0 = q1_01 - q1_00
+    sample1 = ca.SX.sym("sample1", 2, 7)
+    sample1_00 = sample1[0, 0]
+    sample1_01 = sample1[0, 1]
+    sample1_02 = sample1[0, 2]
+    sample1_03 = sample1[0, 3]
+    sample1_04 = sample1[0, 4]
+    sample1_05 = sample1[0, 5]
+    sample1_06 = sample1[0, 6]
+    sample1_10 = sample1[1, 0]
+    sample1_11 = sample1[1, 1]
+    sample1_12 = sample1[1, 2]
+    sample1_13 = sample1[1, 3]
+    sample1_14 = sample1[1, 4]
+    sample1_15 = sample1[1, 5]
+    sample1_16 = sample1[1, 6]
+    sample2 = ca.SX.sym("sample2", 2, 7)
+    sample2_00 = sample2[0, 0]
+    sample2_01 = sample2[0, 1]
+    sample2_02 = sample2[0, 2]
+    sample2_03 = sample2[0, 3]
+    sample2_04 = sample2[0, 4]
+    sample2_05 = sample2[0, 5]
+    sample2_06 = sample2[0, 6]
+    sample2_10 = sample2[1, 0]
+    sample2_11 = sample2[1, 1]
+    sample2_12 = sample2[1, 2]
+    sample2_13 = sample2[1, 3]
+    sample2_14 = sample2[1, 4]
+    sample2_15 = sample2[1, 5]
+    sample2_16 = sample2[1, 6]
+    t0 = sample1_01 - sample1_00
     a1 = t0
-    t1 = q1_02 - q1_00
+    t1 = sample1_02 - sample1_00
     b1 = t1
-    t2 = q1_11 - q1_10
+    t2 = sample1_11 - sample1_10
     c1 = t2
-    t3 = q1_12 - q1_10
+    t3 = sample1_12 - sample1_10
     d1 = t3
     area1 = t0*t3 - t1*t2
     t4 = 1.0/area1
@@ -57,29 +57,29 @@ def seven_points():
     i1_1 = -b1*t4
     i1_2 = -c1*t4
     i1_3 = a1*t4
-    t5 = q1_03 - q1_00
-    t6 = q1_13 - q1_10
+    t5 = sample1_03 - sample1_00
+    t6 = sample1_13 - sample1_10
     u1_3 = i1_0*t5 + i1_1*t6
     v1_3 = i1_2*t5 + i1_3*t6
-    t7 = q1_04 - q1_00
-    t8 = q1_14 - q1_10
+    t7 = sample1_04 - sample1_00
+    t8 = sample1_14 - sample1_10
     u1_4 = i1_0*t7 + i1_1*t8
     v1_4 = i1_2*t7 + i1_3*t8
-    t10 = q1_15 - q1_10
-    t9 = q1_05 - q1_00
+    t10 = sample1_15 - sample1_10
+    t9 = sample1_05 - sample1_00
     u1_5 = i1_0*t9 + i1_1*t10
     v1_5 = i1_2*t9 + i1_3*t10
-    t11 = q1_06 - q1_00
-    t12 = q1_16 - q1_10
+    t11 = sample1_06 - sample1_00
+    t12 = sample1_16 - sample1_10
     u1_6 = i1_0*t11 + i1_1*t12
     v1_6 = i1_2*t11 + i1_3*t12
-    t13 = q2_01 - q2_00
+    t13 = sample2_01 - sample2_00
     a2 = t13
-    t14 = q2_02 - q2_00
+    t14 = sample2_02 - sample2_00
     b2 = t14
-    t15 = q2_11 - q2_10
+    t15 = sample2_11 - sample2_10
     c2 = t15
-    t16 = q2_12 - q2_10
+    t16 = sample2_12 - sample2_10
     d2 = t16
     area2 = t13*t16 - t14*t15
     t17 = 1.0/area2
@@ -87,20 +87,20 @@ def seven_points():
     i2_1 = -b2*t17
     i2_2 = -c2*t17
     i2_3 = a2*t17
-    t18 = q2_03 - q2_00
-    t19 = q2_13 - q2_10
+    t18 = sample2_03 - sample2_00
+    t19 = sample2_13 - sample2_10
     u2_3 = i2_0*t18 + i2_1*t19
     v2_3 = i2_2*t18 + i2_3*t19
-    t20 = q2_04 - q2_00
-    t21 = q2_14 - q2_10
+    t20 = sample2_04 - sample2_00
+    t21 = sample2_14 - sample2_10
     u2_4 = i2_0*t20 + i2_1*t21
     v2_4 = i2_2*t20 + i2_3*t21
-    t22 = q2_05 - q2_00
-    t23 = q2_15 - q2_10
+    t22 = sample2_05 - sample2_00
+    t23 = sample2_15 - sample2_10
     u2_5 = i2_0*t22 + i2_1*t23
     v2_5 = i2_2*t22 + i2_3*t23
-    t24 = q2_06 - q2_00
-    t25 = q2_16 - q2_10
+    t24 = sample2_06 - sample2_00
+    t25 = sample2_16 - sample2_10
     u2_6 = i2_0*t24 + i2_1*t25
     v2_6 = i2_2*t24 + i2_3*t25
     m0 = u2_3*v1_3
@@ -263,12 +263,12 @@ def seven_points():
     e2b_2 = f2_1*f2_5 - f2_2*f2_4
     t46 = f0_0*i2_0 + f0_3*i2_2
     t47 = f0_1*i2_0 + f0_4*i2_2
-    t48 = -i1_0*q1_00 - i1_1*q1_10
-    t49 = -i1_2*q1_00 - i1_3*q1_10
+    t48 = -i1_0*sample1_00 - i1_1*sample1_10
+    t49 = -i1_2*sample1_00 - i1_3*sample1_10
     t50 = f0_0*i2_1 + f0_3*i2_3
     t51 = f0_1*i2_1 + f0_4*i2_3
-    t52 = -i2_0*q2_00 - i2_1*q2_10
-    t53 = -i2_2*q2_00 - i2_3*q2_10
+    t52 = -i2_0*sample2_00 - i2_1*sample2_10
+    t53 = -i2_2*sample2_00 - i2_3*sample2_10
     t54 = f0_6 + f0_0*t52 + f0_3*t53
     t55 = f0_7 + f0_1*t52 + f0_4*t53
     t56 = f1_0*i2_0 + f1_3*i2_2
@@ -326,8 +326,8 @@ def seven_points():
     discriminant[0, 0] = rest
     return ca.Function(
         "seven_points",
-        [q1, q2],
+        [sample1, sample2],
         [F, votes, discriminant],
-        ["q1", "q2"],
+        ["sample1", "sample2"],
         ["F", "votes", "discriminant"],
     )

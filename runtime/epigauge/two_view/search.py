@@ -257,7 +257,7 @@ class _Search:
             if score > self.score:
                 self.F, self.score = F, score
 
-    def best_of(self, F: Array, highest: float) -> float:
+    def best_of(self, F: Array, finalists: int, highest: float) -> float:
         """Improve the best of a batch, where none before scored as high."""
         if not len(F):
             return highest
@@ -266,12 +266,12 @@ class _Search:
         judges = np.arange(min(pool, _JUDGES)) * pool // min(pool, _JUDGES)
         judges = judges if self.order is None else self.order[judges]
         first = self.agreement(F, self.q[:, judges])
-        finalists = np.argsort(-first, kind="stable")[:_FINALISTS]
-        scores = self.agreement(F[finalists], self.q)
+        chosen = np.argsort(-first, kind="stable")[:finalists]
+        scores = self.agreement(F[chosen], self.q)
         best = int(np.argmax(scores))
         if not scores[best] > highest:
             return highest
-        self.improve(F[finalists[best]])
+        self.improve(F[chosen[best]])
         return float(scores[best])
 
     def needed(self) -> float:
@@ -296,7 +296,7 @@ class _Search:
             real = np.array([np.ones(_BATCH, np.bool_), discriminant > 0.0, discriminant > 0.0])
             chosen = np.nonzero((real & (np.abs(votes) == 7.0)).T)
             proposals = _normalized(F.transpose(3, 0, 1, 2)[chosen])
-            before, highest = highest, self.best_of(proposals, highest)
+            before, highest = highest, self.best_of(proposals, _FINALISTS, highest)
             if highest > before:
                 most = self.needed()
         return done
@@ -344,7 +344,8 @@ class _Search:
             two = lines[self.draw(np.full((_BATCH, 2), float(len(rows))))]
             e2 = np.cross(two[:, 0], two[:, 1])
             F = np.cross(e2[:, :, None], H[None], axis=1)
-            highest = self.best_of(_normalized(F), highest)
+            # Matches on the plane, as most judges are, say nothing.
+            highest = self.best_of(_normalized(F), _BATCH, highest)
 
 
 def _epipole(F: Array) -> Array:

@@ -1,0 +1,122 @@
+"""The search for F: compiled and NumPy alike, planes, wrong matches of repeated structure."""
+
+from __future__ import annotations
+
+import epigauge as eg
+import numpy as np
+import pytest
+from epigauge import kernels
+from epigauge.two_view.conditioning import condition
+from epigauge.two_view.search import ranked, search
+from two_views import algebraic
+
+NUMPY = kernels.table("numpy")
+K = np.array([[1000.0, 0.0, 700.0], [0.0, 1000.0, 500.0], [0.0, 0.0, 1.0]])
+R = np.array([[np.cos(0.2), 0.0, np.sin(0.2)], [0.0, 1.0, 0.0], [-np.sin(0.2), 0.0, np.cos(0.2)]])
+
+
+def compiled():
+    if kernels.available()["c"]:
+        pytest.skip("no compiled library")
+    return kernels.table("c")
+
+
+def projected(X, rng, noise_px=0.3):
+    """Return noisy matches of points, and their noise-free ones."""
+    views = (X @ K.T, (X @ R.T + [-1.0, 0.1, 0.2]) @ K.T)
+    x1, x2 = (h[:, :2] / h[:, 2:] for h in views)
+    noisy = (x + noise_px * rng.standard_normal(x.shape) for x in (x1, x2))
+    return *noisy, x1, x2
+
+
+def facade(seed, off=60, on=240, wrong=300):
+    """Return matches of a wall, of some points before it, and wrong ones along its rows."""
+    rng = np.random.default_rng(seed)
+    wall = np.column_stack([rng.uniform(-3, 3, on), rng.uniform(-2, 2, on), np.full(on, 6.0)])
+    free = np.column_stack(
+        [rng.uniform(-2, 2, off), rng.uniform(-1.5, 1.5, off), rng.uniform(3.5, 5.5, off)]
+    )
+    x1, x2, true1, true2 = projected(np.concatenate([wall, free]), rng)
+    rows = rng.integers(0, on, wrong)
+    # A window is taken for another of its row: near the epipolar line, far along it.
+    shifted = wall[rows] + np.column_stack(
+        [rng.uniform(-2.0, 2.0, wrong), rng.normal(0.0, 0.1, wrong), np.zeros(wrong)]
+    )
+    more1, more2 = projected(wall[rows], rng)[0], projected(shifted, rng)[1]
+    return np.concatenate([x1, more1]), np.concatenate([x2, more2]), true1, true2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_compiled_and_numpy_search_are_the_same(seed):
+    table = compiled()
+    x1, x2, _, _ = facade(seed)
+    q = condition(x1, x2).forward(x1, x2)
+    order = ranked(table, *q)
+    np.testing.assert_array_equal(order, ranked(NUMPY, *q))
+    for own in (order, None):
+        one, other = (search(t, *q, own, seed=seed) for t in (table, NUMPY))
+        assert one.samples == other.samples
+        assert one.score == pytest.approx(other.score, rel=1e-9)
+        assert min(np.abs(one.F - other.F).max(), np.abs(one.F + other.F).max()) < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_wrong_matches_of_repeated_structure_do_not_move_a_facade(seed):
+    x1, x2, true1, true2 = facade(seed)
+    result = eg.estimate_fundamental(x1, x2, seed=seed)
+    errors = eg.reprojection_distances(result.F, true1, true2)[0]
+    assert np.sqrt(np.mean(errors**2)) < 0.3
+    assert np.mean(result.inlier[:300]) > 0.9
+    assert result.start == "native"
+
+
+def test_matches_on_a_plane_and_few_off_it_give_f():
+    # A sample of seven is clean of the plane's degeneracy only with two or more matches off it.
+    x1, x2, true1, true2 = facade(5, off=25, on=275, wrong=150)
+    F = eg.estimate_fundamental(x1, x2).F
+    assert np.abs(eg.reprojection_distances(F, true1[-25:], true2[-25:])[0]).max() < 2.0
+
+
+def test_score_says_where_right_matches_are():
+    rng = np.random.default_rng(1)
+    X = np.column_stack([*rng.uniform(-2, 2, (2, 60)), rng.uniform(4, 8, 60)])
+    x1, x2, true1, true2 = projected(X, rng)
+    # 8 % right: without a hint, one sample in 50 million is.
+    wrong1, wrong2 = (rng.uniform(0.0, 1000.0, (700, 2)) for _ in range(2))
+    x1, x2 = np.concatenate([x1, wrong1]), np.concatenate([x2, wrong2])
+    score = np.concatenate([rng.uniform(0.5, 1.0, 60), rng.uniform(0.0, 0.9, 700)])
+    result = eg.estimate_fundamental(x1, x2, score=score)
+    assert np.mean(result.inlier[:60]) > 0.9
+    assert np.abs(eg.reprojection_distances(result.F, true1, true2)[0]).max() < 4.0
+
+
+@pytest.mark.parametrize(
+    ("score", "message"),
+    [
+        (np.ones(3), r"score.*\(300,\)"),
+        (np.full(300, np.nan), "score.*nan"),
+        ("best", "score"),
+    ],
+)
+def test_bad_scores_are_refused(score, message):
+    x1, x2, _, _ = facade(0, wrong=0)
+    with pytest.raises(eg.ArgumentError, match=message):
+        eg.estimate_fundamental(x1, x2, score=score)
+
+
+def test_seven_points_are_the_solutions_of_the_public_function():
+    x = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 2, 7, 50))
+    F, votes, discriminant = kernels.table().seven_points(*x)
+    for i in range(50):
+        expected = eg.fundamental_7point(x[0, :, :, i].T, x[1, :, :, i].T)
+        own = [F[k, :, :, i] for k in range(3 if discriminant[i] > 0.0 else 1)]
+        own = [G / np.linalg.norm(G) for G in own]
+        assert len(own) == len(expected)
+        for G in expected:
+            assert min(np.linalg.norm(s * G - H) for H in own for s in (1, -1)) < 1e-6
+    assert np.abs(votes).max() <= 7
+    scene = eg.two_view_scene(n_points=7, noise_px=0.0, seed=2)
+    F, votes, _ = kernels.table().seven_points(scene.x1.T, scene.x2.T)
+    residuals = [np.abs(algebraic(G / np.linalg.norm(G), scene.x1, scene.x2)).max() for G in F]
+    assert min(residuals) < 1e-6
+    assert 7.0 in np.abs(votes)  # the true one has all points in front of both cameras
