@@ -113,17 +113,20 @@ def _native(
     seed: int,
     rng: np.random.Generator,
 ) -> Agreement | None:
-    """Search at the noise of good detectors, and at more of it where that may not be the noise."""
+    """Search at the noise of good detectors, and at more of it where that may not be the noise.
+
+    At more noise the likelihood of all matches decides, climbed from all that was found.
+    """
     few = consensus.few
     q1, q2 = (np.ascontiguousarray(h[:2, few]) for h in (consensus.h1, consensus.h2))
     order = ranked(kernels, q1, q2) if score is None else np.argsort(-score[few], kind="stable")
     agreements: list[Agreement] = []
-    twice = 1 if q1.shape[1] >= _MANY else 2
-    for scale, turn in itertools.product(SCALES, range(twice)):
+    turns = 1 if q1.shape[1] >= _MANY else 2
+    for scale, turn in itertools.product(SCALES, range(turns)):
         found = search(kernels, q1, q2, order, seed=seed + turn, scale=scale)
         if not found.score > 0.0:
             continue
-        if q1.shape[1] >= _MANY:
+        if scale == SCALES[0] and q1.shape[1] >= _MANY:
             sharp = consensus.judge(found.F, scale, extent=_EXTENT * scale)
             d = np.abs(sharp.signed[few])
             if sharp.sigma <= 2.0 * scale and _is_sharp(
