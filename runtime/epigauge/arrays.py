@@ -17,7 +17,7 @@ from epigauge_generated.signatures import SIGNATURES, Signature
 
 from epigauge.errors import ArgumentError, BackendError
 
-__all__ = ["ArrayTable", "constant", "device", "host", "is_tensor", "namespace", "table"]
+__all__ = ["ArrayTable", "table"]
 
 
 class ArrayTable:
