@@ -7,7 +7,7 @@
 
 const char *eg_digest(void)
 {
-    return "b80f2f2922ff7611";
+    return "d9ef985095e20605";
 }
 
 const char *eg_sources(void)

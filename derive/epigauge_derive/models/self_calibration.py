@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sympy as sp
 
-from epigauge_derive.kernel import Input, Kernel, Output, at, cross, jacobian, log1p, upper
+from epigauge_derive.kernel import Input, Kernel, Let, Output, at, cross, jacobian, log1p, upper
 
 P = Input("P", (3, 4))
 UPDATE = Input("delta", (8,))
@@ -67,7 +67,13 @@ def kernels() -> list[Kernel]:
         sp.Matrix([[1, 0, c[0]], [0, 1, c[1]], [0, 0, 1]]) for c in (c1.matrix(), c2.matrix())
     ]
     centred = shifts[1].T * F.matrix() * shifts[0]
-    squares = [focal_squared(centred, e1.matrix()), focal_squared(centred.T, e2.matrix())]
+    # Differentiated by the entries of F about the principal points, then by the chain rule.
+    G = sp.Matrix(3, 3, lambda i, j: sp.Symbol(f"G{i}{j}", real=True))
+    about = dict(zip(G, centred, strict=True))
+    squares = [focal_squared(G, e1.matrix()), focal_squared(G.T, e2.matrix())]
+    by_G = jacobian(squares, list(G))
+    slopes = sp.Matrix(2, 9, lambda i, j: sp.Symbol(f"slope{i}_{j}", real=True))
+    named = dict(zip(slopes, by_G, strict=True))
     return [
         Kernel(
             "dual_image_rows",
@@ -95,8 +101,11 @@ def kernels() -> list[Kernel]:
             (F, c1, c2, e1, e2),
             (
                 Output.of("squares", squares),
-                Output.of("J_F", jacobian(squares, F.entries())),
-                Output.of("J_c", jacobian(squares, [*c1.entries(), *c2.entries()])),
+                Output.of("J_F", slopes * jacobian(list(centred), F.entries())),
+                Output.of(
+                    "J_c", slopes * jacobian(list(centred), [*c1.entries(), *c2.entries()])
+                ),
             ),
+            (Let(about), Let(named)),
         ),
     ]
