@@ -103,7 +103,7 @@ def constant(array: Any) -> Any:
     if hasattr(array, "detach"):  # PyTorch
         return array.detach()
     if type(array).__module__.partition(".")[0] in ("jax", "jaxlib"):
-        import jax  # type: ignore[import-not-found, unused-ignore]
+        import jax
 
         return jax.lax.stop_gradient(array)
     return array

@@ -95,6 +95,25 @@ class TestCheirality:
         assert r.in_front == 60
         assert "behind the cameras" not in r.flags
 
+    def test_few_right_matches_are_told_from_few_random_ones(self) -> None:
+        # Five leave nothing to judge by; from six on, chance is counted with five parameters.
+        right, named = {5: 0, 6: 0, 8: 0}, {5: 0, 6: 0, 8: 0}
+        for seed in range(6):
+            scene = eg.two_view_scene(seed=seed, n_points=8)
+            rng = np.random.default_rng(seed)
+            for m in named:
+                pair = scene.x1[:m], scene.x2[:m]
+                r = eg.refine_fundamental(*pair, essential=True, K1=scene.K)
+                assert "few matches" in r.flags
+                right[m] += "no common geometry" not in r.flags
+                random = rng.uniform(-250.0, 250.0, (2, m, 2))
+                r = eg.refine_fundamental(*random, essential=True, K1=scene.K)
+                named[m] += "no common geometry" in r.flags
+        assert right[5] == 6
+        assert named[5] == 0
+        assert min(right[6], right[8]) >= 4
+        assert min(named[6], named[8]) >= 5
+
     def test_a_camera_that_only_turned_is_told_from_a_plane(self) -> None:
         rng = np.random.default_rng(2)
         X = np.column_stack([rng.uniform(-1, 1, (60, 2)), rng.uniform(2, 4, 60)])

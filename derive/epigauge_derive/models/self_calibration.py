@@ -102,9 +102,7 @@ def kernels() -> list[Kernel]:
             (
                 Output.of("squares", squares),
                 Output.of("J_F", slopes * jacobian(list(centred), F.entries())),
-                Output.of(
-                    "J_c", slopes * jacobian(list(centred), [*c1.entries(), *c2.entries()])
-                ),
+                Output.of("J_c", slopes * jacobian(list(centred), [*c1.entries(), *c2.entries()])),
             ),
             (Let(about), Let(named)),
         ),

@@ -52,7 +52,7 @@ _FREE = 7
 PAIRS, RANK = 2000, 20
 
 
-def log10_false_alarms(m: int, k: int, chance: float) -> float:
+def log10_false_alarms(m: int, k: int, chance: float, free: int = _FREE) -> float:
     """Return the logarithm of how many chance agreements of k of m matches are expected.
 
     Parameters
@@ -61,6 +61,8 @@ def log10_false_alarms(m: int, k: int, chance: float) -> float:
         Matches, and how many of them agree.
     chance : float
         Probability that a wrong match agrees.
+    free : int
+        Matches that a geometry can be made to agree with.
 
     Returns
     -------
@@ -68,10 +70,10 @@ def log10_false_alarms(m: int, k: int, chance: float) -> float:
         The logarithm to base 10, with Chernoff's bound for the tail of the binomial distribution,
         which is exact for k = m.
     """
-    n, hits = m - _FREE, k - _FREE
+    n, hits = m - free, k - free
     if n <= 0 or hits <= 0 or chance >= hits / n:
         return math.inf
-    sets = (math.lgamma(m + 1) - math.lgamma(_FREE + 1) - math.lgamma(n + 1)) / math.log(10)
+    sets = (math.lgamma(m + 1) - math.lgamma(free + 1) - math.lgamma(n + 1)) / math.log(10)
     if chance <= 0.0:
         return -math.inf
     tail = hits * math.log10(hits / (n * chance))

@@ -136,7 +136,8 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
             judged = best
             raised["gross errors"] = is_inflated(found, judged)
     # So few cannot be significant; but no more geometries than one may agree by chance.
-    few = raised["few matches"] and not found.searched
+    # Where nothing is redundant nothing speaks against them either.
+    few = raised["few matches"] and not found.searched and len(found.inlier) > found.parameters
     wide = found.noise > WIDE * RANGE
     if (judged.searched or wide or few) and not is_common(judged, 0.0 if few else SIGNIFICANT):
         raised["no common geometry"] = True

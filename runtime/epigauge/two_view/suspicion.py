@@ -105,4 +105,4 @@ def is_common(found: Evidence, bar: float = SIGNIFICANT) -> bool:
         return False
     copies = agreed - independent(found.q1[:, near], found.q2[:, near])
     chance = chance_agreement(found.table, found.F, found.all1, found.all2, limit)
-    return log10_false_alarms(m - copies, agreed - copies, chance) <= bar
+    return log10_false_alarms(m - copies, agreed - copies, chance, found.parameters) <= bar
