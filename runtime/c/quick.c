@@ -57,7 +57,7 @@ static double kth(double *values, ptrdiff_t n, ptrdiff_t k)
     return values[k];
 }
 
-static double median(double *values, ptrdiff_t n)
+double eg_median(double *values, ptrdiff_t n)
 {
     const double upper = kth(values, n, n / 2);
     if (n % 2)
@@ -336,7 +336,7 @@ static void judge(scratch_t *s, const double *result, const eg_quick_options *op
     }
     const double noise = sqrt(squares / (double)(n > 8 ? n - 7 : 1));
     memcpy(s->room, s->squares, (size_t)n * sizeof(double));
-    facts[MEDIAN] = sqrt(median(s->room, n));
+    facts[MEDIAN] = sqrt(eg_median(s->room, n));
     const double small = (double)(n > 8 ? n - 7 : 1);
     const double bound = options->tail * 1.4826 * (1.0 + 5.0 / small) * facts[MEDIAN];
     for (ptrdiff_t i = 0; i < n; ++i)

@@ -18,6 +18,13 @@
 #define JUDGES 192
 #define FINALISTS 6
 
+/* The share of the matches that agree, off a plane by so many deviations, up to which F is
+   degenerate; how many deviations blunt the matches on it then judge; what is rounding for others. */
+#define DEGENERATE 0.1
+#define OFF 5.0
+#define BLUNT 3.0
+#define LUCK 0.5
+
 typedef struct {
     ptrdiff_t m;
     const double *q, *q1, *q2; /* (4, m) conditioned, and its halves */
@@ -30,6 +37,9 @@ typedef struct {
     eg_matches near;
     uint64_t drawn;
     double F[9], score;    /* the best geometry so far */
+    double *split;         /* 4 m: (4, off) and (4, m - off), off a plane and on it */
+    ptrdiff_t off;
+    double noise2;         /* where F is degenerate for the plane; else 0 */
 } search_t;
 
 /* A whole number below n: SplitMix64 (Steele, Lea, Flood 2014) of a counter. */
@@ -59,10 +69,10 @@ static void epipole(const double *F, double *e2)
 }
 
 /* Sum of log(1 + scale^2 / (d^2 + floor^2)) over the matches q (4, m). */
-static double agreement(const search_t *s, ptrdiff_t m, const double *q, const double *F)
+static double agreement(double scale2, double floor2, ptrdiff_t m, const double *q,
+                        const double *F)
 {
     const double *x1 = q, *y1 = x1 + m, *x2 = y1 + m, *y2 = x2 + m;
-    const double scale2 = s->scale2, floor2 = s->floor2;
     double sum = 0.0;
     for (ptrdiff_t begin = 0; begin < m; begin += CHUNK) {
         const ptrdiff_t end = m - begin < CHUNK ? m : begin + CHUNK;
@@ -85,9 +95,15 @@ static double agreement(const search_t *s, ptrdiff_t m, const double *q, const d
     return sum;
 }
 
+/* By all matches; by those on a plane that F is degenerate for, bluntly. */
 static double score(const search_t *s, const double *F)
 {
-    return agreement(s, s->m, s->q, F);
+    const double wide2 = BLUNT * BLUNT * s->noise2;
+    const double luck2 = fmax(LUCK * LUCK * s->noise2, s->floor2);
+    if (!(s->noise2 > 0.0))
+        return agreement(s->scale2, s->floor2, s->m, s->q, F);
+    return agreement(s->scale2, luck2, s->off, s->split, F) +
+           agreement(wide2, wide2, s->m - s->off, s->split + 4 * s->off, F);
 }
 
 /* Squared distances to first order; infinity for matches on the wrong side of an epipole. */
@@ -207,7 +223,7 @@ static int improved(search_t *s, ptrdiff_t n, ptrdiff_t finalists, const double 
     double first[3 * BATCH];
     const double *best = NULL;
     for (ptrdiff_t k = 0; k < n; ++k)
-        first[k] = agreement(s, s->judges, s->some, proposals + 9 * k);
+        first[k] = agreement(s->scale2, s->floor2, s->judges, s->some, proposals + 9 * k);
     for (ptrdiff_t trial = 0; trial < finalists && trial < n; ++trial) {
         ptrdiff_t next = 0;
         for (ptrdiff_t k = 1; k < n; ++k)
@@ -261,6 +277,38 @@ static void seven_points(search_t *s, const ptrdiff_t *order, ptrdiff_t *samples
     *samples = done;
 }
 
+static void cross(const double *a, const double *b, double *c)
+{
+    c[0] = a[1] * b[2] - a[2] * b[1];
+    c[1] = a[2] * b[0] - a[0] * b[2];
+    c[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* A plane by least squares of those near it: three matches fix it less well. */
+static void refit(ptrdiff_t n, const double *x, const double *y, const double *kappa,
+                  const double *gain, double limit, double *v)
+{
+    double A[9] = {0.0}, b[3] = {0.0}, rows[9], determinant = 0.0, refined[3];
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double a[3] = {gain[i] * x[i], gain[i] * y[i], gain[i]};
+        if (!(fabs(gain[i] * (kappa[i] - v[0] * x[i] - v[1] * y[i] - v[2])) < limit))
+            continue;
+        for (int k = 0; k < 3; ++k) {
+            b[k] += a[k] * gain[i] * kappa[i];
+            for (int j = 0; j < 3; ++j)
+                A[3 * k + j] += a[k] * a[j];
+        }
+    }
+    for (int k = 0; k < 3; ++k)
+        cross(A + 3 * ((k + 1) % 3), A + 3 * ((k + 2) % 3), rows + 3 * k);
+    for (int k = 0; k < 3; ++k)
+        determinant += A[k] * rows[k];
+    for (int k = 0; k < 3; ++k)
+        refined[k] = (rows[k] * b[0] + rows[3 + k] * b[1] + rows[6 + k] * b[2]) / determinant;
+    if (determinant > 1e-12 * A[0] * A[4] * A[8])
+        memcpy(v, refined, sizeof refined);
+}
+
 /* The plane of most matches that agree: kappa = v^T q by plane and parallax, H = [e']x F + e' v^T.
    Returns how many are near. */
 static ptrdiff_t plane(search_t *s, double *H)
@@ -301,6 +349,7 @@ static ptrdiff_t plane(search_t *s, double *H)
             best[0] = v0, best[1] = v1, best[2] = v2;
         }
     }
+    refit(n, x, y, kappa, gain, limit, best);
     for (int k = 0; k < 3; ++k) {
         const double *F = s->F + k;
         H[k] = e2[1] * F[6] - e2[2] * F[3] + e2[0] * best[k];
@@ -308,13 +357,6 @@ static ptrdiff_t plane(search_t *s, double *H)
         H[6 + k] = e2[0] * F[3] - e2[1] * F[0] + e2[2] * best[k];
     }
     return most;
-}
-
-static void cross(const double *a, const double *b, double *c)
-{
-    c[0] = a[1] * b[2] - a[2] * b[1];
-    c[1] = a[2] * b[0] - a[0] * b[2];
-    c[2] = a[0] * b[1] - a[1] * b[0];
 }
 
 /* The line through both points that a match moves between, off the plane of H. */
@@ -327,25 +369,58 @@ static void moves_along(const search_t *s, const double *H, ptrdiff_t row, doubl
     cross(there, q2, line);
 }
 
+/* If F, so far from a homography by which matches are off by their squares, is degenerate for it:
+   split the matches into those off it and those on it, and judge F again. */
+static void split(search_t *s, const double *squared)
+{
+    const double near2 = 9.0 * s->scale2;
+    double *distances2 = s->work, *sorted = distances2 + s->m, *parts = s->split;
+    ptrdiff_t near = 0, agree = 0, on = 0;
+    distances(s, s->F, distances2);
+    for (ptrdiff_t i = 0; i < s->m; ++i)
+        if (distances2[i] <= near2)
+            sorted[near++] = distances2[i];
+    const double noise2 = fmax(1.4826 * 1.4826 * eg_median(sorted, near), s->floor2);
+    const double limit2 = OFF * OFF * noise2;
+    s->off = 0;
+    for (ptrdiff_t i = 0; i < s->m; ++i)
+        if (!(squared[i] <= limit2)) {
+            agree += distances2[i] <= near2;
+            s->rows[s->off++] = i;
+        }
+    if ((double)agree > DEGENERATE * (double)near)
+        return;
+    for (ptrdiff_t i = 0; i < s->m; ++i)
+        if (squared[i] <= limit2)
+            s->rows[s->off + on++] = i;
+    for (int c = 0; c < 4; ++c) {
+        for (ptrdiff_t k = 0; k < s->off; ++k)
+            parts[c * s->off + k] = s->q[c * s->m + s->rows[k]];
+        for (ptrdiff_t k = 0; k < on; ++k)
+            parts[4 * s->off + c * on + k] = s->q[c * s->m + s->rows[s->off + k]];
+    }
+    s->noise2 = noise2;
+    s->score = score(s, s->F);
+}
+
 /* F = [e']x H of a plane's homography and two matches off it (DEGENSAC: Chum, Werner, Matas 2005). */
 static void plane_and_parallax(search_t *s)
 {
-    double H[9], highest = 0.0, *squared = s->work;
+    double H[9], highest = 0.0, *squared = s->work + 2 * s->m;
     const double off = 9.0 * s->options->scale;
     ptrdiff_t n = 0;
     if (plane(s, H) < 7)
         return;
     eg_homography_squared(s->m, H, s->q1, s->q2, squared);
-    for (ptrdiff_t i = 0; i < s->m; ++i)
-        if (squared[i] > off * off)
-            s->rows[n++] = i;
-    if (n < 2)
-        return;
-    ptrdiff_t *rows = malloc((size_t)n * sizeof *rows);
+    ptrdiff_t *rows = malloc((size_t)s->m * sizeof *rows);
     if (!rows)
         return;
-    memcpy(rows, s->rows, (size_t)n * sizeof *rows);
-    for (int begin = 0; begin < s->options->pairs; begin += BATCH) {
+    for (ptrdiff_t i = 0; i < s->m; ++i)
+        if (squared[i] > off * off)
+            rows[n++] = i;
+    if (n >= 2)
+        split(s, squared);
+    for (int begin = 0; n >= 2 && begin < s->options->pairs; begin += BATCH) {
         double proposals[9 * BATCH];
         ptrdiff_t count = 0;
         for (int trial = 0; trial < BATCH; ++trial) {
@@ -361,10 +436,12 @@ static void plane_and_parallax(search_t *s)
             }
             count += normalized(F);
         }
-        /* Matches on the plane, as most judges are, say nothing. */
+        /* Matches on the plane, as most of the few judges are, say nothing. */
         improved(s, count, count, proposals, &highest);
     }
     free(rows);
+    s->noise2 = 0.0;
+    s->score = score(s, s->F);
 }
 
 /* Share of the matches near one in either image that are near it in both: right matches have
@@ -404,11 +481,11 @@ static void choose_judges(search_t *s, const ptrdiff_t *order)
 EG_EXPORT ptrdiff_t eg_search(ptrdiff_t m, const double *q, const ptrdiff_t *order,
                               const eg_search_options *options, double *F, double *value)
 {
-    double *room = malloc((size_t)(10 * m + 1) * sizeof *room);
+    double *room = malloc((size_t)(14 * m + 1) * sizeof *room);
     ptrdiff_t *rows = malloc((size_t)(m + 1) * sizeof *rows), samples = -1;
     if (room && rows) {
         search_t s = {.m = m, .q = q, .q1 = q, .q2 = q + 2 * m, .options = options, .rows = rows,
-                      .work = room};
+                      .work = room, .split = room + 10 * m};
         choose_judges(&s, order);
         s.scale2 = options->scale * options->scale;
         s.floor2 = s.scale2 * options->floor2;

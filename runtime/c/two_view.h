@@ -98,6 +98,9 @@ typedef struct {
     ptrdiff_t pairs, rank;   /* wrong pairs, and how many must be near */
 } eg_quick_options;
 
+/* The median of some values, which are reordered. */
+double eg_median(double *values, ptrdiff_t n);
+
 /* How to search among raw matches, as in the structure of search.py. */
 typedef struct {
     uint64_t seed;

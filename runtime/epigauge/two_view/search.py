@@ -40,7 +40,7 @@ from epigauge.kernels import Table
 from epigauge.linear import Levenberg
 from epigauge.two_view.criteria import Sampson
 from epigauge.two_view.eliminated import EliminatedProblem
-from epigauge.two_view.losses import Loss
+from epigauge.two_view.losses import Loss, median
 from epigauge.two_view.parameterizations import Ortho
 
 __all__ = ["SCALES", "Found", "ranked", "search"]
@@ -58,6 +58,16 @@ _SAMPLES, _LEAST, _PATIENCE = 20_000, 1_000, 5.0
 
 #: Threes of matches that a plane is tried from, and twos off it that F is.
 _PLANES, _PAIRS = 64, 512
+
+#: Where no more than this share of the matches that agree are off a plane, by so many standard
+#: deviations of the noise, F may be any of the plane. All of these fit its matches alike but for
+#: the noise, each across other epipolar lines: judged sharply, the luckiest of them wins over the
+#: right one and the few matches off the plane. Those on it then judge as bluntly as so many
+#: deviations, and for those off it this part of one is rounding: any two fit exactly.
+_DEGENERATE, _OFF, _BLUNT, _LUCK = 0.1, 5.0, 3.0, 0.5
+
+#: Scales off a plane of matches that an epipole is tried from.
+_FAR = 9.0
 
 #: Iterations of a robust fit at most, and the widths of the fits in scales.
 _STEPS, _WIDTHS = 5, (8.0, 3.0, 1.5)
@@ -194,13 +204,17 @@ class _Search:
     drawn: int = 0
     F: Array = field(default_factory=lambda: np.zeros((3, 3)))
     score: float = 0.0
+    noise: float = 0.0
+    on: NDArray[np.bool_] | None = None
 
     def run(self) -> Found:
         with np.errstate(all="ignore"):  # samples in special position
             samples = self.seven_points()
             if self.score > 0.0:
                 self.plane_and_parallax()
-        return Found(self.F, self.score, samples, self.scale)
+            self.on = None
+            score = float(self.judged(self.F[None])[0])
+        return Found(self.F, score, samples, self.scale)
 
     def draw(self, below: Array) -> Rows:
         """Return whole numbers below some: SplitMix64 of a counter."""
@@ -212,15 +226,30 @@ class _Search:
         uniform = ((z ^ (z >> np.uint64(31))) >> np.uint64(11)).astype(np.float64) * 2.0**-53
         return (uniform.reshape(below.shape) * below).astype(np.intp)
 
-    def agreement(self, F: Array, q: Array) -> Array:
+    def judged(self, F: Array) -> Array:
+        """Return the scores of many F by all matches.
+
+        By those on a plane that F is degenerate for, bluntly.
+        """
+        if self.on is None:
+            return self.agreement(F, self.q)
+        sharp, blunt = self.q[:, ~self.on], self.q[:, self.on]
+        luck = max((_LUCK * self.noise / self.scale) ** 2, _FLOOR)
+        return self.agreement(F, sharp, self.scale, luck) + self.agreement(
+            F, blunt, _BLUNT * self.noise, 1.0
+        )
+
+    def agreement(
+        self, F: Array, q: Array, scale: float | None = None, floor: float = _FLOOR
+    ) -> Array:
         """Return the scores of many F, shape (k, 3, 3)."""
         one = np.ones((1, q.shape[1]))
         q1, q2 = np.concatenate([q[:2], one]), np.concatenate([q[2:], one])
         line2, line1 = F @ q1, np.swapaxes(F, 1, 2) @ q2
         C = np.sum(line2 * q2, axis=1)
         length2 = np.sum(line2[:, :2] ** 2, axis=1) + np.sum(line1[:, :2] ** 2, axis=1)
-        scale2 = self.scale**2
-        ratio = scale2 * length2 / (C**2 + _FLOOR * scale2 * length2 + 1e-300)
+        scale2 = (self.scale if scale is None else scale) ** 2
+        ratio = scale2 * length2 / (C**2 + floor * scale2 * length2 + 1e-300)
         return np.asarray(np.sum(np.log1p(ratio), axis=1))
 
     def distances(self, F: Array) -> Array:
@@ -253,7 +282,7 @@ class _Search:
             if not np.isfinite(found.state.cost):
                 return
             F = found.state.F
-            score = float(self.agreement(F[None], self.q)[0])
+            score = float(self.judged(F[None])[0])
             if score > self.score:
                 self.F, self.score = F, score
 
@@ -267,7 +296,7 @@ class _Search:
         judges = judges if self.order is None else self.order[judges]
         first = self.agreement(F, self.q[:, judges])
         chosen = np.argsort(-first, kind="stable")[:finalists]
-        scores = self.agreement(F[chosen], self.q)
+        scores = self.judged(F[chosen])
         best = int(np.argmax(scores))
         if not scores[best] > highest:
             return highest
@@ -324,6 +353,13 @@ class _Search:
         counts[~np.isfinite(planes).all(axis=1)] = 0
         best = int(np.argmax(counts))
         v = planes[best] if counts[best] else np.zeros(3)
+        # Three matches fix the plane less well than all that are on it
+        on = np.abs(off[best]) < limit
+        equations = (gain * np.concatenate([q1, np.ones((1, len(rows)))]))[:, on]
+        A, b = equations @ equations.T, equations @ (gain * kappa)[on]
+        minors = np.cross(np.roll(A, -1, axis=0), np.roll(A, -2, axis=0))
+        if (determinant := A[0] @ minors[0]) > 1e-12 * np.prod(np.diag(A)):
+            v = minors.T @ b / determinant
         return int(counts[best]), np.cross(e2, self.F, axisb=0, axisc=0) + np.outer(e2, v)
 
     def plane_and_parallax(self) -> None:
@@ -333,9 +369,16 @@ class _Search:
             return
         q1, q2 = self.q[:2], self.q[2:]
         squared = self.kernels.homography_squared(H, q1, q2)
-        rows = np.flatnonzero(squared > (9.0 * self.scale) ** 2)
+        rows = np.flatnonzero(squared > (_FAR * self.scale) ** 2)
         if len(rows) < 2:
             return
+        distances = self.distances(self.F)
+        near = distances <= (3.0 * self.scale) ** 2
+        noise2 = max(1.4826**2 * median(distances[near]), _FLOOR * self.scale**2)
+        on = squared <= _OFF**2 * noise2
+        if np.count_nonzero(~on[near]) <= _DEGENERATE * np.count_nonzero(near):
+            self.on, self.noise = on, noise2**0.5
+            self.score = float(self.judged(self.F[None])[0])
         one = np.ones((1, len(rows)))
         there = H @ np.concatenate([q1[:, rows], one])
         lines = np.cross(there, np.concatenate([q2[:, rows], one]), axis=0).T
@@ -344,7 +387,7 @@ class _Search:
             two = lines[self.draw(np.full((_BATCH, 2), float(len(rows))))]
             e2 = np.cross(two[:, 0], two[:, 1])
             F = np.cross(e2[:, :, None], H[None], axis=1)
-            # Matches on the plane, as most judges are, say nothing.
+            # Matches on the plane, as most of the few judges are, say nothing.
             highest = self.best_of(_normalized(F), _BATCH, highest)
 
 
