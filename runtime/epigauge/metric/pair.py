@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
-from epigauge._arguments import as_positive, as_real
+from epigauge._arguments import as_fundamental, as_positive, as_real
 from epigauge.errors import ArgumentError
 
 __all__ = ["FocalLengths", "focal_lengths"]
@@ -17,6 +17,10 @@ Array = NDArray[np.float64]
 
 #: Relative standard deviations beyond which a focal length is weak, or open.
 WEAK, OPEN = 0.05, 0.3
+
+
+#: Largest coordinate of a principal point that is accepted, pixels.
+_FARTHEST = 1e9
 
 
 class FocalLengths(NamedTuple):
@@ -99,11 +103,17 @@ def focal_lengths(
     >>> np.round(found.focal_px, 6).tolist(), found.flag
     ([800.0, 900.0], '')
     """
-    matrix = _checked("F", F, (3, 3))
+    matrix = as_fundamental(F, "F")
+    values = np.linalg.svd(matrix, compute_uv=False)
+    if values[1] <= 1e-14 * values[0]:
+        raise ArgumentError("F", "has rank 1", "a matrix of rank 2")
     c = np.concatenate([_checked("centre1", centre1, (2,)), _checked("centre2", centre2, (2,))])
-    if not np.any(matrix):
-        raise ArgumentError("F", "is zero", "a fundamental matrix")
-    C = np.zeros((9, 9)) if covariance is None else _checked("covariance", covariance, (9, 9))
+    if np.abs(c).max() > _FARTHEST:
+        raise ArgumentError("centre1, centre2", f"reach {np.abs(c).max():.3g} px", "image points")
+    C = np.zeros((9, 9))
+    if covariance is not None:
+        rescaling = float(np.abs(matrix).max() / np.abs(np.asarray(F, dtype=np.float64)).max())
+        C = _checked("covariance", covariance, (9, 9)) * rescaling**2
     centre_std = as_positive("centre_std_px", centre_std_px, zero=True)
     # In units of which focal lengths are about one, and F of norm one.
     unit = max(float(np.abs(c).mean()), 100.0) * 3.0
