@@ -24,7 +24,8 @@ def flat_scene(system: BundleSystem, noise_px: float) -> bool:
     _, values, axes = np.linalg.svd(X, full_matrices=False)
     V = system.normal.V
     size = np.maximum(np.einsum("mii->m", V), 1e-300)[:, None, None]
-    across = np.linalg.solve(V + 1e-14 * size * np.eye(3), axes[2][:, None])[..., 0] @ axes[2]
+    normals = np.broadcast_to(axes[2][:, None], (len(V), 3, 1))
+    across = np.linalg.solve(V + 1e-14 * size * np.eye(3), normals)[..., 0] @ axes[2]
     noise = noise_px * np.sqrt(np.median(np.maximum(across, 0.0)))
     thickness = values[2] / np.sqrt(len(X))
     return bool(thickness <= max(_THICK * noise, _THIN * values[0] / np.sqrt(len(X))))
