@@ -1,9 +1,11 @@
-"""What all tests share: where the real data lies, and that Ctrl-C can be tested."""
+"""What all tests share: the real data, the command line, and that Ctrl-C can be tested."""
 
 from __future__ import annotations
 
 import os
 import signal
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -57,3 +59,22 @@ def data_dir() -> Path:
 def pair(request: pytest.FixtureRequest, data_dir: Path) -> Path:
     """NPZ file of one measured image pair; a test that asks for it runs once a pair."""
     return data_dir / "pairs" / f"{request.param}.npz"
+
+
+@pytest.fixture
+def run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, str]]:
+    """Run the command line in this process: (exit code, stdout, stderr)."""
+    pytest.importorskip("typer", reason="the command line needs typer")
+    pytest.importorskip("rich", reason="the command line needs rich")
+    from epigauge.__main__ import main
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["epigauge", *map(str, arguments)])
+        with pytest.raises(SystemExit) as caught:
+            main()
+        code = caught.value.code
+        return (0 if code is None else code, *capsys.readouterr())
+
+    return run

@@ -25,20 +25,6 @@ RESULT = eg.refine_fundamental(SCENE.x1, SCENE.x2, noise_px=None)
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
-    """Run the command line in this process: (exit code, stdout, stderr)."""
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["epigauge", *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
-            main()
-        code = caught.value.code
-        return (0 if code is None else code, *capsys.readouterr())
-
-    return run
-
-
-@pytest.fixture
 def pair_file(tmp_path) -> Path:
     path = tmp_path / "pair.csv"
     save_matches(path, Matches(SCENE.x1, SCENE.x2))

@@ -14,7 +14,6 @@ import pytest
 pytest.importorskip("typer", reason="the command line needs typer")
 pytest.importorskip("rich", reason="the command line needs rich")
 
-from epigauge.__main__ import main
 from epigauge.multi_view.display import Display, display
 from rich.console import Console
 from rich.progress import Progress
@@ -23,20 +22,6 @@ SCENE = eg.multi_view_scene(n_points=30, distance=4.0, seed=4)
 
 #: The command line watches every step, and then the loop in Python runs: the same to the last bit.
 RESULT = eg.bundle_adjust(SCENE.tracks, callback=lambda row: None)
-
-
-@pytest.fixture
-def run(monkeypatch, capsys):
-    """Run the command line in this process: (exit code, stdout, stderr)."""
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["epigauge", *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
-            main()
-        code = caught.value.code
-        return (0 if code is None else code, *capsys.readouterr())
-
-    return run
 
 
 @pytest.fixture

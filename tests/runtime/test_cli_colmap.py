@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import sqlite3
-import sys
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import epigauge as eg
@@ -17,25 +17,16 @@ from colmap_databases import Project, change, content, pair_id
 pytest.importorskip("typer", reason="the command line needs typer")
 pytest.importorskip("rich", reason="the command line needs rich")
 
-from epigauge.__main__ import main
 from epigauge.io import _sqlite
 
 PROJECT = Project()
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
-    """Run the command line in this process: (exit code, stdout, stderr)."""
+def run(run, monkeypatch):
+    """Run this command: (exit code, stdout, stderr)."""
     monkeypatch.setenv("COLUMNS", "120")
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["epigauge", "colmap", *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
-            main()
-        code = caught.value.code
-        return (0 if code is None else code, *capsys.readouterr())
-
-    return run
+    return partial(run, "colmap")
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
+from functools import partial
 from pathlib import Path
 
 import epigauge as eg
@@ -14,7 +14,6 @@ from photographs import rendered
 pytest.importorskip("typer", reason="the command line needs typer")
 pytest.importorskip("rich", reason="the command line needs rich")
 
-from epigauge.__main__ import main
 
 cv2 = pytest.importorskip("cv2", reason="photographs need OpenCV")
 
@@ -37,18 +36,10 @@ def result(photos) -> tuple[eg.ImageMatches, eg.RobustResult]:
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
-    """Run the command line in this process: (exit code, stdout, stderr)."""
+def run(run, monkeypatch):
+    """Run this command: (exit code, stdout, stderr)."""
     monkeypatch.setenv("COLUMNS", "120")
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["epigauge", "pair", *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
-            main()
-        code = caught.value.code
-        return (0 if code is None else code, *capsys.readouterr())
-
-    return run
+    return partial(run, "pair")
 
 
 def document(text: str) -> dict:

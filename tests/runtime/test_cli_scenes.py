@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import epigauge as eg
@@ -13,24 +12,9 @@ import pytest
 pytest.importorskip("typer", reason="the command line needs typer")
 pytest.importorskip("rich", reason="the command line needs rich")
 
-from epigauge.__main__ import main
 from epigauge.bundle.run import PROJECTIVE_ONLY
 from epigauge.bundle.strategies import STRATEGIES
 from metric_scenes import metric_scene
-
-
-@pytest.fixture
-def run(monkeypatch, capsys):
-    """Run the command line in this process: (exit code, stdout, stderr)."""
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["epigauge", *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
-            main()
-        code = caught.value.code
-        return (0 if code is None else code, *capsys.readouterr())
-
-    return run
 
 
 def started(model: str, **options: object) -> tuple[eg.Tracks, eg.MetricReconstruction]:

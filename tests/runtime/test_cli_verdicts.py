@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import epigauge as eg
@@ -17,20 +16,16 @@ from two_views import Array
 pytest.importorskip("typer", reason="the command line needs typer")
 pytest.importorskip("rich", reason="the command line needs rich")
 
-from epigauge.__main__ import main
-
 
 @pytest.fixture
-def run(monkeypatch, capsys):
+def run(run):
     """Run the command line in this process: exit code and the JSON document on stdout."""
 
-    def run(*arguments: object) -> tuple[int, dict]:
-        monkeypatch.setattr(sys, "argv", ["epigauge", *map(str, arguments), "--json"])
-        with pytest.raises(SystemExit) as caught:
-            main()
-        return caught.value.code or 0, json.loads(capsys.readouterr().out)
+    def run_json(*arguments: object) -> tuple[int, dict]:
+        code, out, _ = run(*arguments, "--json")
+        return code, json.loads(out)
 
-    return run
+    return run_json
 
 
 def moved(n: int, t: list[float]) -> tuple[Array, Array]:

@@ -73,21 +73,6 @@ def test_copies_replace_nothing(tmp_path: Path) -> None:
 
 
 class TestCommandLine:
-    @pytest.fixture
-    def run(self, monkeypatch, capsys):
-        pytest.importorskip("typer", reason="the command line needs typer")
-        pytest.importorskip("rich", reason="the command line needs rich")
-        from epigauge.__main__ import main
-
-        def run(*arguments: object) -> tuple[int, str, str]:
-            monkeypatch.setattr(sys, "argv", ["epigauge", *map(str, arguments)])
-            with pytest.raises(SystemExit) as caught:
-                main()
-            code = caught.value.code
-            return (0 if code is None else code, *capsys.readouterr())
-
-        return run
-
     def test_samples_are_listed_and_copied(self, run, tmp_path: Path) -> None:
         code, out, err = run("samples")
         assert code == 0
