@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Arrow", "Dense", "Levenberg", "Seber"]
+__all__ = ["BENT", "LAM_FLOOR", "LIFT", "Arrow", "Dense", "Levenberg", "Seber"]
 
 Array = NDArray[np.float64]
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 LAM_FLOOR = 1e-11
 
 #: A direction of negative curvature is lifted this far above zero, relative to the curvature.
-_LIFT = 1e-3
+LIFT = 1e-3
 
 
 class _Solvable(Protocol):
@@ -34,7 +34,7 @@ class _Solvable(Protocol):
 
 #: A correction for the bend of a valley is taken when its square is below this much of the step's:
 #: Transtrum and Sethna's bound on twice its length, 0.75.
-_BENT = 0.375**2
+BENT = 0.375**2
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class Dense:
         """
         scale, values, vectors = self._scaled if scaled else self._plain
         lowest = values[0] + lam
-        shift = lam if lowest > 0.0 else lam - (1.0 + _LIFT) * values[0]
+        shift = lam if lowest > 0.0 else lam - (1.0 + LIFT) * values[0]
         damped = np.maximum(values + shift, np.finfo(float).tiny)
 
         def apply(right: Array) -> Array:
@@ -125,7 +125,7 @@ class Dense:
         if self.bend is not None:
             v = step / scale
             bent = 0.5 * apply((self.bend @ v) @ v)
-            if bent @ bent <= _BENT * (step @ step):
+            if bent @ bent <= BENT * (step @ step):
                 step = step + bent
         return np.asarray(step / scale)
 

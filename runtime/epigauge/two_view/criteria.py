@@ -8,7 +8,7 @@ parameterised; a parameterisation knows nothing of criteria.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ __all__ = [
     "LineDistances",
     "Mahalanobis",
     "Reprojection",
+    "settled",
 ]
 
 Array = NDArray[np.float64]
@@ -281,9 +282,14 @@ CRITERIA: dict[str, type[Reprojection] | type[Sampson] | type[Epipolar]] = {
 }
 
 
+def settled(multiplier: Any, change: Any, d: Any) -> Any:
+    """Return which foot points the last Newton step has left in place, of any array library."""
+    return abs(change * d) <= (_SETTLED * abs(d) + 1e-15) * abs(multiplier)
+
+
 def _unsettled(multiplier: Array, change: Array, d: Array) -> NDArray[np.bool_]:
     """Return which foot points the last Newton step has still moved, or lost (NaN)."""
-    return ~np.asarray(np.abs(change * d) <= (_SETTLED * np.abs(d) + 1e-15) * np.abs(multiplier))
+    return ~np.asarray(settled(multiplier, change, d))
 
 
 def _unwhitening(q: Array, covariance: Array) -> Array:

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from epigauge import arrays, lm
 from epigauge._arguments import as_weights, check_general_position
 from epigauge.errors import ArgumentError
-from epigauge.linear import LAM_FLOOR, Levenberg
+from epigauge.linear import BENT, LAM_FLOOR, LIFT, Levenberg
 from epigauge.two_view.conditioning import OFFSET, RMS
 from epigauge.two_view.copies import counted_once
+from epigauge.two_view.criteria import settled
 
 __all__ = ["REFUSED", "Minimum", "like", "refine_pairs", "refined"]
 
@@ -321,11 +322,11 @@ class _Problem:
         frame = feet.bilinear_frame(F)
         with np.errstate(all="ignore"):  # Newton may step onto a pole
             multiplier, change, d = feet.foot_point(*frame, self.q1, self.q2)
-            settled = xp.abs(change * d) <= (1e-6 * xp.abs(d) + 1e-15) * xp.abs(multiplier)
-        if not bool(xp.all(settled)):
+            good = settled(multiplier, change, d)
+        if not bool(xp.all(good)):
             safe, _, safe_d = feet.foot_point_safe(*frame, self.q1, self.q2)
-            multiplier = xp.where(settled, multiplier, safe)
-            d = xp.where(settled, d, safe_d)
+            multiplier = xp.where(good, multiplier, safe)
+            d = xp.where(good, d, safe_d)
         return multiplier, d, frame
 
     def cost(self, factors: tuple[Tensor, Tensor, Tensor]) -> Tensor:
@@ -414,13 +415,13 @@ class _System:
         """Return the damped steps, bent like the valley where that is short against them."""
         xp = self.xp
         lowest = self.values[:, 0]
-        shift = xp.where(lowest + lam > 0.0, lam, lam - 1.001 * lowest)
+        shift = xp.where(lowest + lam > 0.0, lam, lam - (1.0 + LIFT) * lowest)
         least = float(xp.finfo(self.values.dtype).smallest_normal)
         damped = xp.clip(self.values + shift[:, None], least)
         step = self.along(self.gradient, damped)
         curved = xp.sum(self.bend * step[:, None, None, :], axis=-1)
         bent = 0.5 * self.along(xp.sum(curved * step[:, None, :], axis=-1), damped)
-        mild = xp.sum(bent**2, axis=-1) <= 0.375**2 * xp.sum(step**2, axis=-1)
+        mild = xp.sum(bent**2, axis=-1) <= BENT * xp.sum(step**2, axis=-1)
         return step + xp.where(mild[:, None], bent, 0.0)
 
     def decrement(self) -> Tensor:
