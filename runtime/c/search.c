@@ -68,6 +68,23 @@ static void epipole(const double *F, double *e2)
     }
 }
 
+/* A match in the line F q1 = (a, b, c): C = q2^T F q1, length2 the square of its gradient. The
+   kernel `sampson` also writes derivatives, which a search has no use for. */
+typedef struct {
+    double a, b, c, C, length2;
+} sampson_t;
+
+static inline sampson_t sampson(const double *F, double x1, double y1, double x2, double y2)
+{
+    const double a = F[0] * x1 + F[1] * y1 + F[2];
+    const double b = F[3] * x1 + F[4] * y1 + F[5];
+    const double c = F[6] * x1 + F[7] * y1 + F[8];
+    const double d = F[0] * x2 + F[3] * y2 + F[6];
+    const double e = F[1] * x2 + F[4] * y2 + F[7];
+    const sampson_t at = {a, b, c, a * x2 + b * y2 + c, a * a + b * b + d * d + e * e};
+    return at;
+}
+
 /* Sum of log(1 + scale^2 / (d^2 + floor^2)) over the matches q (4, m). */
 static double agreement(double scale2, double floor2, ptrdiff_t m, const double *q,
                         const double *F)
@@ -81,14 +98,8 @@ static double agreement(double scale2, double floor2, ptrdiff_t m, const double 
 #pragma omp simd reduction(* : product)
 #endif
         for (ptrdiff_t i = begin; i < end; ++i) {
-            const double a = F[0] * x1[i] + F[1] * y1[i] + F[2];
-            const double b = F[3] * x1[i] + F[4] * y1[i] + F[5];
-            const double c = F[6] * x1[i] + F[7] * y1[i] + F[8];
-            const double d = F[0] * x2[i] + F[3] * y2[i] + F[6];
-            const double e = F[1] * x2[i] + F[4] * y2[i] + F[7];
-            const double C = a * x2[i] + b * y2[i] + c;
-            const double length2 = a * a + b * b + d * d + e * e;
-            product *= 1.0 + scale2 * length2 / (C * C + floor2 * length2 + 1e-300);
+            const sampson_t at = sampson(F, x1[i], y1[i], x2[i], y2[i]);
+            product *= 1.0 + scale2 * at.length2 / (at.C * at.C + floor2 * at.length2 + 1e-300);
         }
         sum += log1p(product - 1.0);
     }
@@ -114,16 +125,10 @@ static void distances(const search_t *s, const double *F, double *squared)
     epipole(F, e2);
     EG_SUM(votes)
     for (ptrdiff_t i = 0; i < s->m; ++i) {
-        const double a = F[0] * x1[i] + F[1] * y1[i] + F[2];
-        const double b = F[3] * x1[i] + F[4] * y1[i] + F[5];
-        const double c = F[6] * x1[i] + F[7] * y1[i] + F[8];
-        const double d = F[0] * x2[i] + F[3] * y2[i] + F[6];
-        const double e = F[1] * x2[i] + F[4] * y2[i] + F[7];
-        const double C = a * x2[i] + b * y2[i] + c;
-        const double length2 = a * a + b * b + d * d + e * e;
-        squared[i] = C * C / (length2 + 1e-300);
-        side[i] = (e2[1] - e2[2] * y2[i]) * a + (e2[2] * x2[i] - e2[0]) * b +
-                  (e2[0] * y2[i] - e2[1] * x2[i]) * c;
+        const sampson_t at = sampson(F, x1[i], y1[i], x2[i], y2[i]);
+        squared[i] = at.C * at.C / (at.length2 + 1e-300);
+        side[i] = (e2[1] - e2[2] * y2[i]) * at.a + (e2[2] * x2[i] - e2[0]) * at.b +
+                  (e2[0] * y2[i] - e2[1] * x2[i]) * at.c;
         votes += side[i] > 0.0 ? 1.0 : -1.0;
     }
     for (ptrdiff_t i = 0; i < s->m; ++i)
