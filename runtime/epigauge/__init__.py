@@ -69,6 +69,7 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge.two_view.refine import refine_fundamental
     from epigauge.two_view.result import FundamentalResult
     from epigauge.two_view.robust import RobustResult, estimate_fundamental
+    from epigauge.two_view.robust_batch import RobustBatch, estimate_fundamental_batch
     from epigauge.uncertainty.affine import AffineCovariance
     from epigauge.uncertainty.covariance import MetricCovariance
 
@@ -101,6 +102,7 @@ __all__ = [
     "PositionPrior",
     "Reconstruction",
     "ReconstructionCovariance",
+    "RobustBatch",
     "RobustResult",
     "RotationPrior",
     "Tracks",
@@ -116,6 +118,7 @@ __all__ = [
     "covariance",
     "datasets",
     "estimate_fundamental",
+    "estimate_fundamental_batch",
     "focal_lengths",
     "fundamental_7point",
     "fundamental_8point",
@@ -179,6 +182,7 @@ _WHERE = {
     "two_view.refine": "refine_fundamental",
     "two_view.result": "FundamentalResult",
     "two_view.robust": "RobustResult estimate_fundamental",
+    "two_view.robust_batch": "RobustBatch estimate_fundamental_batch",
     "uncertainty.affine": "AffineCovariance",
     "uncertainty.covariance": "MetricCovariance",
 }

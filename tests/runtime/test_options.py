@@ -60,6 +60,7 @@ def test_options_that_are_passed_on_are_all_there_are(
         lambda **k: eg.refine_fundamental(VIEW.x1, VIEW.x2, **k),
         lambda **k: eg.estimate_fundamental(VIEW.x1, VIEW.x2, **k),
         lambda **k: eg.refine_fundamental_batch(VIEW.x1, VIEW.x2, [0, 50], **k),
+        lambda **k: eg.estimate_fundamental_batch(VIEW.x1, VIEW.x2, [0, 50], **k),
         lambda **k: eg.compare(SCENE.tracks, ["covariant"], **k),
         lambda **k: eg.bundle_adjust(SCENE.tracks, **k),
         lambda **k: eg.colmap.refine_database("absent.db", **k),

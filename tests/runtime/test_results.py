@@ -50,6 +50,7 @@ MADE: dict[str, Callable[[], Any]] = {
     "essential": lambda: eg.refine_fundamental(VIEW.x1, VIEW.x2, essential=True, K1=K),
     "robust": lambda: eg.estimate_fundamental(VIEW.x1, VIEW.x2),
     "batch": batch,
+    "robust batch": lambda: eg.estimate_fundamental_batch(VIEW.x1, VIEW.x2, [0, len(VIEW.x1)]),
     "bundle": lambda: BUNDLE,
     "metric bundle": lambda: ADJUSTED,
     "comparison": lambda: eg.compare(TRACKS, ["covariant", "free"]),

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import partial
+from itertools import chain
 from types import SimpleNamespace
-from typing import Any, Unpack
+from typing import Any, TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -175,22 +177,36 @@ def refine_fundamental_batch(
             _ = found.flags  # computed when asked for
         return found
     x1, x2 = as_matches(x1, x2, at_least=0)
-    bounds = _as_offsets(offsets, len(x1))
+    bounds = as_offsets(offsets, len(x1))
     count = len(bounds) - 1
     w = None if weights is None else as_weights(weights, len(x1))
     needed = f"a ({count}, 3, 3) array"
     starts = None if F0 is None else np.ascontiguousarray(as_real("F0", F0, needed))
     if starts is not None and starts.shape != (count, 3, 3):
         raise ArgumentError("F0", f"has shape {starts.shape}", f"({count}, 3, 3)")
-    _check_options(known)
+    check_options(known)
     if executor is not None:
-        return _elsewhere(executor, (x1, x2, bounds, starts, w), known, progress)
+        no_callback(known)
+        call = partial(refine_fundamental_batch, flags=True, **known)
+        more = {"weights": w}, {"F0": starts}
+        return elsewhere(executor, call, (x1, x2, bounds), *more, _PART, progress)
     work = _Work(x1, x2, bounds, starts, w, known)
     size = 1 if work.plan.native is None else _CHUNK
     chunks = [range(first, min(first + size, count)) for first in range(0, count, size)]
-    done = 0
+    threads(work.refine, chunks, workers, progress)
+    return work.result(flags)
+
+
+def threads(
+    work: Callable[[range], object],
+    chunks: list[range],
+    workers: int,
+    progress: Callable[[int, int], object] | None,
+) -> None:
+    """Work on chunks of pairs in threads; tell of every pair from the calling one."""
+    done, count = 0, chunks[-1].stop if chunks else 0
     with ThreadPoolExecutor(as_count("workers", workers)) as pool:
-        futures = {pool.submit(work.refine, chunk): chunk for chunk in chunks}
+        futures = {pool.submit(work, chunk): chunk for chunk in chunks}
         try:
             for future in as_completed(futures):
                 future.result()
@@ -201,63 +217,99 @@ def refine_fundamental_batch(
         finally:  # the pool waits for what was submitted: after an error or Ctrl-C, drop the rest
             for future in futures:
                 future.cancel()
-    return work.result(flags)
 
 
-def _elsewhere(
+Batch = TypeVar("Batch", bound=FundamentalBatch)
+
+
+def elsewhere(
     executor: Executor,
-    pairs: tuple[Array, Array, NDArray[np.intp], Array | None, Array | None],
-    options: dict[str, Any],
+    call: Callable[..., Batch],
+    matches: tuple[Array, Array, NDArray[np.intp]],
+    per_match: dict[str, Array | None],
+    per_pair: dict[str, Array | None],
+    size: int,
     progress: Callable[[int, int], object] | None,
-) -> FundamentalBatch:
-    """Refine in parts wherever an executor has room, and join the results in order."""
-    x1, x2, bounds, starts, weights = pairs
+) -> Batch:
+    """Call a batch function for parts of some pairs wherever an executor has room.
+
+    Parameters
+    ----------
+    executor : Executor
+        As of `refine_fundamental_batch`.
+    call : callable
+        Takes x1, x2 and offsets of a part, and the arguments by name; computes everything, since
+        results travel back. A `functools.partial` of the function and of its other options.
+    matches : (ndarray, ndarray, ndarray)
+        x1, x2 and offsets of all pairs.
+    per_match, per_pair : dict
+        Arguments with a row a match, and with a row a pair.
+    size : int
+        Pairs a part.
+    progress : callable or None
+        As of `refine_fundamental_batch`.
+
+    Returns
+    -------
+    FundamentalBatch
+        The results in order, of the kind that `call` returns.
+    """
+    x1, x2, bounds = matches
     count = len(bounds) - 1
     if not callable(getattr(executor, "submit", None)):
         needed = "one as of concurrent.futures: it has a method submit"
         raise ArgumentError("executor", f"is of type {type(executor).__name__}", needed)
-    if options.get("callback") is not None:
-        raise ArgumentError("callback", "cannot be called from elsewhere", "none with an executor")
     futures = {}
-    for first in range(0, max(count, 1), _PART):
-        last = min(first + _PART, count)
-        rows = slice(int(bounds[first]), int(bounds[last]))
-        futures[first] = executor.submit(
-            refine_fundamental_batch,
-            x1[rows],
-            x2[rows],
-            bounds[first : last + 1] - bounds[first],
-            None if starts is None else starts[first:last],
-            weights=None if weights is None else weights[rows],
-            flags=True,
-            **options,
-        )
-    parts, done = [], 0
+    for first in range(0, max(count, 1), size):
+        last = min(first + size, count)
+        rows, own = slice(int(bounds[first]), int(bounds[last])), slice(first, last)
+        more = {
+            name: None if value is None else value[chosen]
+            for arguments, chosen in ((per_match, rows), (per_pair, own))
+            for name, value in arguments.items()
+        }
+        offsets = bounds[first : last + 1] - bounds[first]
+        futures[first] = executor.submit(call, x1[rows], x2[rows], offsets, **more)
+    parts: list[Batch] = []
+    done = 0
     try:
         for first, future in futures.items():
             parts.append(future.result())
-            for _ in range(min(_PART, count - first)):
+            for _ in range(min(size, count - first)):
                 done += 1
                 if progress is not None:
                     progress(done, count)
     finally:  # after an error or Ctrl-C, drop what has not begun
         for future in futures.values():
             future.cancel()
-    fields: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in parts])
-        for name in FundamentalBatch.__dataclass_fields__
-        if name not in ("reasons", "flags")
-    }
-    reasons = {
-        first + k: reason
-        for first, part in zip(futures, parts, strict=True)
-        for k, reason in part.reasons.items()
-    }
-    flags = tuple(flags for part in parts for flags in part.flags)
-    return FundamentalBatch(**fields, reasons=reasons, flags=flags)
+    return _joined(parts, list(futures), bounds)
 
 
-def _as_offsets(offsets: ArrayLike, m: int) -> NDArray[np.intp]:
+def no_callback(options: dict[str, Any]) -> None:
+    """Refuse a callback among options that travel."""
+    if options.get("callback") is not None:
+        raise ArgumentError("callback", "cannot be called from elsewhere", "none with an executor")
+
+
+def _joined(parts: list[Batch], firsts: list[int], bounds: NDArray[np.intp]) -> Batch:
+    """Put parts of a batch together, which begin with these pairs."""
+    values: dict[str, Any] = {}
+    for name in type(parts[0]).__dataclass_fields__:
+        own = [getattr(part, name) for part in parts]
+        if name == "reasons":
+            values[name] = {
+                first + k: reason
+                for first, reasons in zip(firsts, own, strict=True)
+                for k, reason in reasons.items()
+            }
+        elif name == "offsets":
+            values[name] = bounds
+        else:
+            values[name] = tuple(chain(*own)) if name == "flags" else np.concatenate(own)
+    return type(parts[0])(**values)
+
+
+def as_offsets(offsets: ArrayLike, m: int) -> NDArray[np.intp]:
     """Check that offsets partition m matches."""
     bounds = as_array("offsets", offsets, "an (n + 1,) array")
     if bounds.ndim != 1 or len(bounds) < 1 or bounds.dtype.kind not in "iu":
@@ -267,7 +319,7 @@ def _as_offsets(offsets: ArrayLike, m: int) -> NDArray[np.intp]:
     return bounds.astype(np.intp)
 
 
-def _check_options(options: dict[str, Any]) -> None:
+def check_options(options: dict[str, Any]) -> None:
     """Raise now, and not once a pair, what is wrong with every pair: tried on a made-up one."""
     # Which no callback is to hear of.
     options = {name: value for name, value in options.items() if name != "callback"}
@@ -282,7 +334,7 @@ def _over_arrays(
     if not arrays.is_tensor(x1):
         x1, x2 = as_matches(x1, x2, at_least=0)
     host1, host2 = as_matches(arrays.host(x1), arrays.host(x2), at_least=0)
-    bounds = _as_offsets(offsets, len(host1))
+    bounds = as_offsets(offsets, len(host1))
     known = tensors.refined(x1, x2, (host1, host2), bounds, F0, weights, options)
     convert = tensors.like(x1)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from types import SimpleNamespace
-from typing import Any, ClassVar, Literal, Unpack
+from typing import Any, ClassVar, Literal, NamedTuple, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,7 +26,7 @@ from epigauge.two_view.losses import robust_scale
 from epigauge.two_view.refine import calibrations, refine_fundamental
 from epigauge.two_view.result import FundamentalResult
 
-__all__ = ["RobustResult", "estimate_fundamental"]
+__all__ = ["Estimate", "RobustResult", "estimate_fundamental", "estimated"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -160,10 +160,10 @@ def estimate_fundamental(
     (True, 0.0)
     """
     known = known_options("estimate_fundamental", options, RefineOptions, ("F0",))
-    return _estimated(x1, x2, robust, threshold_px, score, seed, known)
+    return estimated(x1, x2, robust, threshold_px, score, seed, known).result
 
 
-def _estimated(
+def estimated(
     x1: ArrayLike,
     x2: ArrayLike,
     robust: str,
@@ -171,7 +171,7 @@ def _estimated(
     score: ArrayLike | None,
     seed: int,
     options: dict[str, Any],
-) -> RobustResult:
+) -> Estimate:
     """Find the fundamental matrix, options being those of `refine_fundamental`."""
     calibration = calibrations(
         bool(options.get("essential", False)), options.get("K1"), options.get("K2")
@@ -221,20 +221,8 @@ def _estimated(
             sigma = robust_scale(agreement.signed[used])
             limit = min(limit, max(_DEVIATIONS * sigma, 1e-9))
         inlier = _at_least(least, agreement, limit)
-    known = {
-        entry.name: getattr(refined, entry.name)
-        for entry in fields(refined)
-        if entry.name not in ("flags", "success")
-    }
     plain = options["noise_px"] is None and options.get("loss", "linear") == "linear"
-    if plain and refined.noise_px > 0.0:
-        # The threshold has cut off the tails of the right matches.
-        noise_px = untruncated(refined.noise_px, limit_px)
-        factor = noise_px / refined.noise_px
-        spread = replace(refined._uncertainty, root=factor * refined._uncertainty.root)
-        known |= {"noise_px": noise_px, "_uncertainty": spread}
-        known["covariance"] = spread.of_fundamental()
-    known |= {
+    known = {
         "inlier": used[copies],
         "used": rows[used],
         "threshold_px": limit_px,
@@ -252,7 +240,43 @@ def _estimated(
         agreeing = agreed.inliers(bound)  # where fewer than 8, "no common geometry"
         return _judged(refined, raw, agreeing, bound * frame.scale)
 
-    return RobustResult.partial(known, judged)
+    return Estimate(
+        RobustResult.partial(
+            known | _cheap(refined),
+            lambda: _rest(refined, limit_px if plain else None),
+            flags=judged,
+            success=judged,
+        ),
+        frame.scale * agreement.signed[copies],
+    )
+
+
+class Estimate(NamedTuple):
+    """A result, and the signed distances (m,) in pixels of all matches to its F."""
+
+    result: RobustResult
+    distances: Array
+
+
+def _cheap(refined: FundamentalResult) -> dict[str, Any]:
+    """Return the fields that are there and stay as they are."""
+    later = ("flags", "success", "noise_px", "covariance", "_uncertainty")
+    names = (entry.name for entry in fields(refined))
+    return {name: vars(refined)[name] for name in names if name in vars(refined).keys() - later}
+
+
+def _rest(refined: FundamentalResult, limit_px: float | None) -> SimpleNamespace:
+    """Return all fields but flags and success, the noise as a limit cuts it off undone."""
+    names = (entry.name for entry in fields(refined) if entry.name not in ("flags", "success"))
+    known = {name: getattr(refined, name) for name in names}
+    if limit_px is not None and refined.noise_px > 0.0:
+        # The threshold has cut off the tails of the right matches.
+        noise_px = untruncated(refined.noise_px, limit_px)
+        factor = noise_px / refined.noise_px
+        spread = replace(refined._uncertainty, root=factor * refined._uncertainty.root)
+        known |= {"noise_px": noise_px, "_uncertainty": spread}
+        known["covariance"] = spread.of_fundamental()
+    return SimpleNamespace(**known)
 
 
 @dataclass(frozen=True)
