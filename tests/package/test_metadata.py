@@ -39,3 +39,25 @@ def test_version_is_one() -> None:
 @pytest.mark.parametrize("package", ["runtime/epigauge", "generated/epigauge_generated"])
 def test_package_says_that_it_is_typed(package: str) -> None:
     assert (CHECKOUT / package / "py.typed").is_file()
+
+
+def test_conda_recipe_asks_for_what_the_package_asks_for() -> None:
+    recipe = (CHECKOUT / "packaging" / "conda" / "recipe.yaml").read_text()
+    assert re.search(rf'^  version: "{re.escape(epigauge.__version__)}"$', recipe, re.MULTILINE)
+    extras = PROJECT["optional-dependencies"]
+    asked = dict(
+        line.split(",")[0].split(">=")
+        for line in (
+            *PROJECT["dependencies"],
+            *(line for extra in extras.values() for line in extra),
+        )
+        if ">=" in line
+    )
+    renamed = {"matplotlib-base": "matplotlib"}
+    stated = dict(re.findall(r"^ +- ([\w-]+) >=([\d.]+)$", recipe, re.MULTILINE))
+    stated.pop("cmake")
+    build = stated.pop("scikit-build-core")
+    assert f"scikit-build-core>={build}" in (CHECKOUT / "pyproject.toml").read_text()
+    assert f">={stated.pop('python')}" == PROJECT["requires-python"]
+    assert {"numpy", "typer", "rich"} <= stated.keys()
+    assert {name: asked[renamed.get(name, name)] for name in stated} == stated
