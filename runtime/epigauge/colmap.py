@@ -1,4 +1,4 @@
-"""Fundamental matrices of a COLMAP database, refined and put back.
+"""Raw matches of a COLMAP database verified; fundamental matrices refined and put back.
 
 >>> import epigauge as eg
 >>> result = eg.colmap.refine_database("database.db")  # doctest: +SKIP
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._arguments import as_count
+from epigauge._colmap_verification import CONFIGS, DatabaseVerification, verify_database
 from epigauge._options import PairOptions, known_options
 from epigauge._results import Result
 from epigauge.errors import ArgumentError, FileFormatError
@@ -31,7 +32,14 @@ from epigauge.verdicts import ordered
 if TYPE_CHECKING:
     from epigauge.io.colmap import VerifiedPairs
 
-__all__ = ["VERDICTS", "DatabaseResult", "refine_database"]
+__all__ = [
+    "CONFIGS",
+    "VERDICTS",
+    "DatabaseResult",
+    "DatabaseVerification",
+    "refine_database",
+    "verify_database",
+]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

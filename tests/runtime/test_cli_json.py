@@ -29,6 +29,7 @@ COMMANDS = {
     "bundle, scene": "bundle scene.npz",
     "compare": "compare tracks.csv --methods covariant,free",
     "colmap": "colmap database.db",
+    "colmap, raw": "colmap database.db --from-matches",
     "demo": "demo --trials 1 --no-plot",
     "data": "data",
     "info": "info",

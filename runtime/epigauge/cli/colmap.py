@@ -1,13 +1,9 @@
-"""``epigauge colmap``: the fundamental matrices of a COLMAP database, refined."""
+"""``epigauge colmap``: the pairs of a COLMAP database, refined, or verified from raw matches."""
 
 from __future__ import annotations
 
-import csv
-import io
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,7 +12,6 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 from rich.table import Table
 
 from epigauge._options import Backend, Loss
@@ -31,12 +26,12 @@ from epigauge.cli._common import (
     shown,
     write_json,
 )
+from epigauge.cli._database import ROWS, name_of, progress, save_pairs
+from epigauge.cli._verification import verify
 from epigauge.colmap import DatabaseResult, refine_database
-from epigauge.io import save_result, writing
-from epigauge.io._common import cut
+from epigauge.errors import ArgumentError
 
-#: Rows of the table before it leaves out what is in order.
-_ROWS = 40
+_MAX_ITER = 100
 
 _COLOURS = {"refined": "green", "skipped": "dim"}
 
@@ -50,9 +45,16 @@ def colmap(
         bool, typer.Option(help="With --write: copy the database to DATABASE.bak first.")
     ] = True,
     loss: Annotated[Loss, choice(Loss, "Of each squared residual.")] = "linear",
-    max_iter: Annotated[int, typer.Option(help="Trial steps allowed a pair.")] = 100,
+    max_iter: Annotated[int, typer.Option(help="Trial steps allowed a pair.")] = _MAX_ITER,
     workers: Annotated[int, typer.Option(help="Threads.")] = 1,
     backend: Annotated[Backend | None, choice(Backend, "See `epigauge info`.")] = None,
+    from_matches: Annotated[
+        bool,
+        typer.Option(
+            "--from-matches",
+            help="Verify the raw matches; with --write, store what each pair is.",
+        ),
+    ] = False,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Save all pairs: CSV, or NPZ with more.")
     ] = None,
@@ -64,12 +66,21 @@ def colmap(
     entries of F, row by row, x2^T F x1 = 0 in COLMAP's pixels. With --write, F of
     the pairs called refined is stored in the database, in one transaction;
     without, the file is only read. Everything else in it stays as it is.
+
+    With --from-matches, the raw matches of all pairs that are not verified yet
+    are, as by COLMAP's geometric verification: the lines are F of the pairs with
+    general motion. With --write, what each pair is, its inliers and its F, E and H
+    are stored; a second run goes on where the first one was stopped.
     """
     if output is not None:
         check_target(output, ".csv", ".npz")
+    if from_matches:
+        if loss != "linear" or max_iter != _MAX_ITER:
+            raise ArgumentError("--from-matches", "takes no --loss or --max-iter", "it alone")
+        return verify(database, write, backup, workers, backend, output, json)
     out = console()
     begin = time.perf_counter()
-    with _progress(out, not json) as callback:
+    with progress(out, not json) as callback:
         result = refine_database(
             database,
             write=write,
@@ -82,7 +93,7 @@ def colmap(
         )
     seconds = time.perf_counter() - begin
     if output is not None:
-        _save(output, result)
+        save_pairs(output, result, [_row(result, k) for k in range(len(result))])
     if json:
         rows = [_row(result, k) for k in range(len(result))]
         counts = {"stored": int(result.stored.sum()), "backup": result.backup}
@@ -93,18 +104,6 @@ def colmap(
             typer.echo(f"{result.image_id[k, 0]} {result.image_id[k, 1]} {numbers}")
         _report(out, result, database, seconds)
     return BAD_INPUT if set(result.verdict) == {"skipped"} else DONE
-
-
-@contextmanager
-def _progress(out: Console, wanted: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """Show a bar on a terminal; yield the callback that moves it."""
-    if not (wanted and out.is_terminal):
-        yield None
-        return
-    columns = (BarColumn(), MofNCompleteColumn(), "pairs", TimeRemainingColumn())
-    with Progress(*columns, console=out, transient=True) as bar:
-        task = bar.add_task("", total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def _row(result: DatabaseResult, k: int) -> dict[str, Any]:
@@ -129,26 +128,6 @@ def _row(result: DatabaseResult, k: int) -> dict[str, Any]:
     }
 
 
-def _save(path: Path, result: DatabaseResult) -> None:
-    """Write all pairs: arrays to NPZ, a line a pair to CSV."""
-    if path.suffix.lower() == ".npz":
-        names = list(result.names.items())
-        more = {"names": [name for _, name in names], "name_id": [number for number, _ in names]}
-        save_result(path, result, **more)
-        return
-    with writing(path) as file:
-        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
-        table = csv.writer(text, lineterminator="\n")
-        for k in range(len(result)):
-            row = _row(result, k)
-            F = row.pop("F").ravel().tolist()
-            if not k:
-                table.writerow([*row, *(f"F{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))])
-            table.writerow([*row.values(), *F])
-        text.flush()
-        text.detach()
-
-
 def _report(out: Console, result: DatabaseResult, source: Path, seconds: float) -> None:
     """Tell people on stderr what came out."""
     title = f"{escape(shown(source))}: RMS in pixels"
@@ -161,13 +140,13 @@ def _report(out: Console, result: DatabaseResult, source: Path, seconds: float) 
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("verdict", overflow="fold")
     order = list(range(len(result)))
-    if len(result) > _ROWS:  # those to look at, as far as there is room
-        order = [k for k in order if result.verdict[k] != "refined"][:_ROWS]
+    if len(result) > ROWS:  # those to look at, as far as there is room
+        order = [k for k in order if result.verdict[k] != "refined"][:ROWS]
     for k in order:
         colour = _COLOURS.get(result.verdict[k], "red")
         note = f": {escape(result.note[k])}" if result.note[k] else ""
         table.add_row(
-            *(_name(result, number) for number in result.image_id[k].tolist()),
+            *(name_of(result.names, number) for number in result.image_id[k].tolist()),
             str(result.inliers[k]),
             *(_pixels(rms[k]) for rms in (result.rms_before_px, result.rms_px)),
             f"[{colour}]{result.verdict[k]}[/]{note}",
@@ -186,10 +165,6 @@ def _report(out: Console, result: DatabaseResult, source: Path, seconds: float) 
         rows["backup"] = escape(shown(Path(result.backup)))
     rows["seconds"] = f"{seconds:.2f}"
     out.print(facts("", rows))
-
-
-def _name(result: DatabaseResult, number: int) -> str:
-    return escape(cut(result.names.get(number, f"image {number}")))
 
 
 def _pixels(rms: float) -> str:

@@ -65,16 +65,45 @@ def inliers(row: Any, keypoints_of: Callable[[int], Points | str]) -> tuple[Arra
         Points of image 1 and 2 in COLMAP's pixels; or why the pair cannot be used.
     """
     pair_id, rows, cols, data, config, _ = row
-    image_ids = divmod(pair_id, MAX_IMAGES)
-    if not 0 <= image_ids[0] < image_ids[1]:
-        return f"pair_id {pair_id} stands for no two images"
     if config not in CONFIGS:
         return f"config is {cut(config)}, needed: 0 to {max(CONFIGS)}"
     if CONFIGS[config]:
         return CONFIGS[config]
+    found = joined(pair_id, rows, cols, data, keypoints_of, "inliers")
+    return found if isinstance(found, str) else found[1:]
+
+
+def joined(
+    pair_id: int,
+    rows: Any,
+    cols: Any,
+    data: Any,
+    keypoints_of: Callable[[int], Points | str],
+    what: str,
+) -> tuple[NDArray[np.uint32], Array, Array] | str:
+    """Return the keypoints that the matches of a pair join.
+
+    Parameters
+    ----------
+    pair_id, rows, cols, data
+        As the database holds them.
+    keypoints_of : callable
+        `keypoints` of an image.
+    what : {"inliers", "matches"}
+        What an error calls them.
+
+    Returns
+    -------
+    (ndarray, ndarray, ndarray) of shape (m, 2), or str
+        Numbers of the keypoints, and points of image 1 and 2 in COLMAP's pixels; or why the pair
+        cannot be used.
+    """
+    image_ids = divmod(pair_id, MAX_IMAGES)
+    if not 0 <= image_ids[0] < image_ids[1]:
+        return f"pair_id {pair_id} stands for no two images"
     matches = _table(rows, cols, data, np.dtype("<u4"), (2,))
     if isinstance(matches, str):
-        return f"inliers: {matches}"
+        return f"{what}: {matches}"
     places = []
     for column, image_id in enumerate(image_ids):
         points = keypoints_of(image_id)
@@ -82,13 +111,14 @@ def inliers(row: Any, keypoints_of: Callable[[int], Points | str]) -> tuple[Arra
             return points
         numbers = matches[:, column]
         if len(numbers) and numbers.max() >= len(points):
-            return f"an inlier is keypoint {numbers.max()} of {len(points)} of image {image_id}"
+            one = {"inliers": "an inlier", "matches": "a match"}[what]
+            return f"{one} is keypoint {numbers.max()} of {len(points)} of image {image_id}"
         place = points[numbers].astype(np.float64)
         if not np.isfinite(place).all():
             bad = numbers[np.flatnonzero(~np.isfinite(place).all(axis=1))[0]]
             return f"keypoint {bad} of image {image_id} is not finite"
         places.append(place)
-    return places[0], places[1]
+    return matches, places[0], places[1]
 
 
 def _table(

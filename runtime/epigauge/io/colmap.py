@@ -26,7 +26,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,13 +42,6 @@ Indices = NDArray[np.int64]
 
 #: Versions of the schema that are read: none, COLMAP 3 and COLMAP 4.0 to 4.2.
 _VERSIONS = (range(1), range(3000, 4000), range(4_000_000, 4_030_000))
-
-#: Table, its key, and the other columns used.
-_TABLES = (
-    ("images", "image_id", ("name",)),
-    ("keypoints", "image_id", ("rows", "cols", "data")),
-    ("two_view_geometries", "pair_id", ("rows", "cols", "data", "config", "F")),
-)
 
 #: Most bytes of a value: keypoints of six columns.
 _LONGEST = 24 * MAX_MATCHES
@@ -112,6 +105,13 @@ class ColmapDatabase:
         If it cannot be opened, or another program has locked it.
     """
 
+    #: Table, its key, and the other columns used.
+    tables: ClassVar[tuple[tuple[str, str, tuple[str, ...]], ...]] = (
+        ("images", "image_id", ("name",)),
+        ("keypoints", "image_id", ("rows", "cols", "data")),
+        ("two_view_geometries", "pair_id", ("rows", "cols", "data", "config", "F")),
+    )
+
     def __init__(self, path: PathLike, *, write: bool = False) -> None:
         self.path = Path(path)
         self._write = write
@@ -122,7 +122,7 @@ class ColmapDatabase:
             try:
                 self._stamp = stamp(self.path) if unguarded else None
                 self._connection.execute("BEGIN IMMEDIATE" if self._write else "BEGIN")
-                _check_schema(self.path, self._connection, self._write)
+                self._check_schema()
             except BaseException:
                 self._connection.close()
                 raise
@@ -280,38 +280,40 @@ class ColmapDatabase:
         query = "SELECT rows, cols, data FROM keypoints WHERE image_id = ?"
         return keypoints(image_id, self._connection.execute(query, (image_id,)).fetchone())
 
-
-def _check_schema(path: Path, connection: sqlite3.Connection, write: bool) -> None:
-    """Refuse what is not a database of a known version of COLMAP."""
-    # A view or a virtual table has no root page; what it computes may never end.
-    tables = {
-        name
-        for (name,) in connection.execute(
-            "SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage > 0"
-        )
-    }
-    for table, _, _ in _TABLES:
-        if table not in tables:
-            reason = f"is no COLMAP database, or one of an old COLMAP: it has no table {table}"
-            raise FileFormatError(path, reason)
-    (version,) = connection.execute("PRAGMA user_version").fetchone()
-    if not any(version in known for known in _VERSIONS):
-        reason = f"has version {version} of COLMAP's schema; known are those up to COLMAP 4.2"
-        raise FileFormatError(path, reason)
-    for table, key, columns in _TABLES:
-        plain = {
-            name: (kind.upper(), in_key)
-            for _, name, kind, _, _, in_key, hidden in connection.execute(
-                f"PRAGMA table_xinfo({table})"
+    def _check_schema(self) -> None:
+        """Refuse what is not a database of a known version of COLMAP."""
+        path, connection = self.path, self._connection
+        # A view or a virtual table has no root page; what it computes may never end.
+        tables = {
+            name
+            for (name,) in connection.execute(
+                "SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage > 0"
             )
-            if not hidden  # as computed columns are
         }
-        if plain.get(key) != ("INTEGER", 1):
-            raise FileFormatError(path, f"is no COLMAP database: {key} is not the key of {table}")
-        for column in columns:
-            if column not in plain:
-                reason = f"table {table} has no column {column}: open it in a new COLMAP"
+        for table, _, _ in self.tables:
+            if table not in tables:
+                reason = f"is no COLMAP database, or one of an old COLMAP: it has no table {table}"
                 raise FileFormatError(path, reason)
-    triggers = "SELECT count(*) FROM sqlite_master WHERE type = 'trigger'"
-    if write and connection.execute(triggers).fetchone() != (0,):
-        raise FileFormatError(path, "has triggers, which COLMAP does not make: not written to")
+        (version,) = connection.execute("PRAGMA user_version").fetchone()
+        if not any(version in known for known in _VERSIONS):
+            reason = f"has version {version} of COLMAP's schema; known are those up to COLMAP 4.2"
+            raise FileFormatError(path, reason)
+        for table, key, columns in self.tables:
+            plain = {
+                name: (kind.upper(), in_key)
+                for _, name, kind, _, _, in_key, hidden in connection.execute(
+                    f"PRAGMA table_xinfo({table})"
+                )
+                if not hidden  # as computed columns are
+            }
+            if plain.get(key) != ("INTEGER", 1):
+                raise FileFormatError(
+                    path, f"is no COLMAP database: {key} is not the key of {table}"
+                )
+            for column in columns:
+                if column not in plain:
+                    reason = f"table {table} has no column {column}: open it in a new COLMAP"
+                    raise FileFormatError(path, reason)
+        triggers = "SELECT count(*) FROM sqlite_master WHERE type = 'trigger'"
+        if self._write and connection.execute(triggers).fetchone() != (0,):
+            raise FileFormatError(path, "has triggers, which COLMAP does not make: not written to")
