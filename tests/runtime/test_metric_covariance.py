@@ -160,6 +160,87 @@ def test_what_no_datum_changes_is_propagated_alike_in_all() -> None:
         )
 
 
+def test_projections_are_propagated_alike_in_all_datums() -> None:
+    """Into views of the network, and into a new one mounted to a view: as by differences."""
+    tracks, scene = metric_scene("SIMPLE_RADIAL", 2, n_points=16, n_cameras=2)
+    dense = Dense(scene, ("f", "k"))
+    blank = eg.Tracks(*np.divmod(np.arange(64), 16), np.zeros((64, 2)))
+    J = dense.jacobian(lambda s: s.project(tracks).ravel())
+
+    def at(i: int, j: int) -> int:
+        """Return the row of a view and a point."""
+        return int(np.flatnonzero((blank.view == i) & (blank.point == j))[0])
+
+    datum, C = conditions(dense, "all points")
+    expected = dense.covariance(J.T @ J, C)
+    options: dict[str, Any] = {"refine": ("f", "k")}
+    first = eg.covariance(tracks, scene, datum, 1.0, **options)
+    slopes = dense.jacobian(lambda s: s.project(blank).ravel()).reshape(64, 2, -1)
+    turn, arm = turned(np.array([0.1, -0.2, 0.05])), np.array([0.4, -0.3, 0.2])
+    vague = np.diag([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.03]) ** 2
+
+    def mounted(s: eg.MetricReconstruction) -> eg.MetricReconstruction:
+        """Return the scene with its first view replaced by one mounted to view 1."""
+        R = s.R.copy()
+        R[0] = turn @ s.R[1]
+        centres = s.centres
+        centres[0] = s.centres[1] + s.R[1].T @ arm
+        return eg.MetricReconstruction(R, -np.einsum("nij,nj->ni", R, centres), s.X, s.cameras)
+
+    own = dense.jacobian(lambda s: mounted(s).project(blank)[at(0, 6)])
+    for name in DATUMS:
+        cov = first.in_gauge(conditions(dense, name)[0])
+        found = cov.of_projections(blank.view[[3, 20, 47]], blank.point[[3, 20, 47]])
+        for block, k in zip(found, (3, 20, 47), strict=True):
+            wanted = slopes[k] @ expected @ slopes[k].T
+            np.testing.assert_allclose(block, wanted, atol=1e-6 * np.abs(wanted).max())
+        R, centre, _ = cov.relative_pose(1, 2)
+        # Of an arm of no length not even the scale matters.
+        spread = cov.projection(6, turn, np.zeros(3), 1, relative_to=1)[1]
+        same = first.projection(6, turn, np.zeros(3), 1, relative_to=1)[1]
+        np.testing.assert_allclose(spread, same, atol=1e-8 * np.abs(same).max())
+        xy, _ = cov.projection(5, R, centre, int(scene.cameras.camera_of_view[2]), relative_to=1)
+        np.testing.assert_allclose(xy, scene.project(blank)[at(2, 5)], rtol=1e-10)
+    xy, spread = first.projection(6, turn, arm, 0, relative_to=1)
+    np.testing.assert_allclose(xy, mounted(scene).project(blank)[at(0, 6)], rtol=1e-12)
+    wanted = own @ expected @ own.T
+    np.testing.assert_allclose(spread, wanted, atol=1e-6 * np.abs(wanted).max())
+    # The uncertainty of the mount itself: turns about the axes of view 1, and the arm.
+    more = first.projection(6, turn, arm, 0, relative_to=1, covariance=vague)[1] - spread
+    step, rows = 1e-6, []
+    for k in range(6):
+        ends = []
+        for sign in (1.0, -1.0):
+            small = sign * step * np.eye(6)[k]
+            R = turn @ turned(small[:3]).T
+            ends.append(first.projection(6, R, arm + small[3:], 0, relative_to=1)[0])
+        rows.append((ends[0] - ends[1]) / (2.0 * step))
+    slope = np.stack(rows, axis=1)
+    wanted = slope @ vague @ slope.T
+    np.testing.assert_allclose(more, wanted, atol=1e-6 * np.abs(wanted).max())
+    # A pose in the frame of the scene: intrinsics and point alone.
+    k, scene_pose = at(3, 6), (scene.R[3], scene.centres[3])
+    camera, point = dense.camera(1), dense.point(6)
+    own = slopes[k][:, np.r_[camera, point]]
+    alone = expected[np.ix_(np.r_[camera, point], np.r_[camera, point])]
+    xy, spread = first.projection(6, *scene_pose, 1)
+    np.testing.assert_allclose(xy, scene.project(blank)[k], rtol=1e-12)
+    np.testing.assert_allclose(spread, own @ alone @ own.T, atol=1e-6 * np.abs(spread).max())
+    for call, name_ in (
+        (lambda: first.projection(99, turn, arm), "point"),
+        (lambda: first.projection(0, 2.0 * turn, arm), "R"),
+        (lambda: first.projection(0, turn, arm, 7), "camera"),
+        (lambda: first.projection(0, turn, [0.0, 1.0]), "centre"),
+        (lambda: first.projection(0, turn, arm, relative_to=9), "relative_to"),
+        (lambda: first.projection(0, turn, arm, covariance=-np.eye(6)), "covariance"),
+        (lambda: first.of_projections([0], [99]), "point"),
+        (lambda: first.of_projections([0.5], [1]), "view"),
+    ):
+        with pytest.raises(eg.ArgumentError) as error:
+            call()
+        assert error.value.argument == name_
+
+
 def test_fixed_views_and_points_have_no_variance() -> None:
     tracks, scene = metric_scene("PINHOLE", 5, n_points=16)
     dense = Dense(scene, ())

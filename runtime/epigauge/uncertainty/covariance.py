@@ -15,6 +15,7 @@ from epigauge.bundle.similarity import Similarity
 from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.uncertainty.datum import Projection, projection
+from epigauge.uncertainty.gauge_free import GaugeFree
 from epigauge.uncertainty.inverse import Inverse, Part, spread
 from epigauge.uncertainty.sandwich import Sandwich
 
@@ -48,12 +49,13 @@ class Std(Result):
 
 
 @dataclass(frozen=True, eq=False)
-class MetricCovariance(Result):
+class MetricCovariance(GaugeFree, Result):
     """Covariances of a calibrated reconstruction in a datum.
 
     A view has six numbers: its small rotation about the axes of the scene (radians), and its
     centre. `camera`, `intrinsics`, `point` and `between` give any block; each is computed when it
-    is asked for, and no matrix of all unknowns is formed.
+    is asked for, and no matrix of all unknowns is formed. `distance`, `ratio`, `angle`,
+    `relative_pose` and projections are propagated from these.
 
     Attributes
     ----------
@@ -239,107 +241,6 @@ class MetricCovariance(Result):
             them.
         """
         return np.block([[self.between(a, b) for b in parts] for a in parts])
-
-    def distance(self, i: int, j: int) -> tuple[float, float]:
-        """Return the distance of two points and its standard deviation.
-
-        Parameters
-        ----------
-        i, j : int
-            Points.
-
-        Returns
-        -------
-        tuple of float
-            In the unit of the scene. The deviation is the same in every datum where priors hold
-            the scale; else it is that in the datum, and only ratios are free of it.
-        """
-        length, slope = self._length(i, j)
-        return length, self._sigma([("point", i), ("point", j)], slope)
-
-    def ratio(self, first: tuple[int, int], second: tuple[int, int]) -> tuple[float, float]:
-        """Return the ratio of two distances of points and its standard deviation, in any datum.
-
-        Parameters
-        ----------
-        first, second : tuple of int
-            Ends of the distances.
-
-        Returns
-        -------
-        tuple of float
-            First over second.
-        """
-        (a, over_a), (b, over_b) = self._length(*first), self._length(*second)
-        slope = np.concatenate([over_a / b, -a / b**2 * over_b])
-        return a / b, self._sigma([("point", k) for k in (*first, *second)], slope)
-
-    def angle(self, i: int, vertex: int, j: int) -> tuple[float, float]:
-        """Return the angle between two points at a third one and its deviation, in any datum.
-
-        Parameters
-        ----------
-        i, vertex, j : int
-            Points.
-
-        Returns
-        -------
-        tuple of float
-            In radians.
-        """
-        X = self.reconstruction.X
-        sides = X[i] - X[vertex], X[j] - X[vertex]
-        units = [side / np.linalg.norm(side) for side in sides]
-        cosine = float(units[0] @ units[1])
-        angle = float(np.arctan2(np.linalg.norm(np.cross(*units)), cosine))
-        # The end of a side moves the angle by its part across the side, away from the other one.
-        slopes = []
-        for side, unit, other in zip(sides, units, units[::-1], strict=True):
-            across = cosine * unit - other
-            slopes.append(across / max(np.linalg.norm(across), 1e-300) / np.linalg.norm(side))
-        slope = np.concatenate([slopes[0], -slopes[0] - slopes[1], slopes[1]])
-        return angle, self._sigma([("point", k) for k in (i, vertex, j)], slope)
-
-    def relative_pose(self, i: int, j: int) -> tuple[Array, Array, Array]:
-        """Return view j as seen from view i, and its covariance.
-
-        Parameters
-        ----------
-        i, j : int
-            Views.
-
-        Returns
-        -------
-        R, c : ndarray, shape (3, 3), (3,)
-            R_j R_i^T, and the centre of j in the frame of i.
-        covariance : ndarray, shape (6, 6)
-            Of the small rotation of j about the axes of view i, and of c: the same in every datum,
-            but for the scale where nothing holds it.
-        """
-        both = self.joint([("camera", i), ("camera", j)])
-        scene = self.reconstruction
-        R = scene.R[i]
-        apart = scene.centres[j] - scene.centres[i]
-        slope = np.zeros((6, 12))
-        slope[:3, :3], slope[:3, 6:9] = -R, R
-        # c = R_i (C_j - C_i); the view i turns by w: c changes by -R_i (w x apart).
-        slope[3:, :3] = R @ np.cross(apart, np.eye(3)).T
-        slope[3:, 3:6], slope[3:, 9:] = -R, R
-        return scene.R[j] @ R.T, R @ apart, np.asarray(slope @ both @ slope.T)
-
-    def _length(self, i: int, j: int) -> tuple[float, Array]:
-        """Return the distance of two points, and its derivatives (6,)."""
-        for name, index in (("i", i), ("j", j)):
-            self._part(name, ("point", index))
-        apart = self.reconstruction.X[i] - self.reconstruction.X[j]
-        length = float(np.linalg.norm(apart))
-        if not length > 0.0:
-            raise ArgumentError("i, j", f"are at one place ({i}, {j})", "points apart")
-        return length, np.concatenate([apart, -apart]) / length
-
-    def _sigma(self, parts: Sequence[tuple[str, int]], slope: Array) -> float:
-        variance = float(slope @ self.joint(parts) @ slope)
-        return float(max(variance, 0.0) ** 0.5)
 
     @cached_property
     def std(self) -> Std:
