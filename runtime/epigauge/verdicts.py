@@ -92,6 +92,11 @@ FLAGS = {
         "the standard deviation of a focal length exceeds a twentieth of it",
         "add views that are turned against the others, or give the focal length",
     ),
+    "model error": Flag(
+        "the views contradict one another in the focal length by more than noise explains: its "
+        "standard deviation was widened to cover that",
+        "try another camera model, look for wrong matches, or calibrate the camera",
+    ),
     "unlike cameras": Flag(
         "cameras with square pixels and the intrinsics they are said to share do not explain the "
         "tracks nearly as well as projective cameras do",

@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
 from epigauge._arguments import as_array, as_count, as_real
-from epigauge.cameras import MetricReconstruction, camera_model
+from epigauge.cameras import MetricReconstruction
 from epigauge.errors import ArgumentError
+from epigauge.metric.deviation import focal_lengths_of, known_to, turn_std
 from epigauge.metric.motion import motion_flags
 from epigauge.metric.pair import OPEN, WEAK
 from epigauge.metric.samples import sampled
@@ -44,9 +45,11 @@ class MetricUpgrade:
         Cameras and points after metric adjustment; None where nothing was found, then `flags` say
         why.
     focal_px, focal_std_px : float or ndarray, shape (c,)
-        Focal length in pixels and its standard deviation, to first order, of one camera, or of each
-        of several (the mean of fx and fy of models that have both). The deviation is infinite where
-        nothing determines it.
+        Focal length in pixels and its standard deviation, of one camera, or of each of several (the
+        mean of fx and fy of models that have both). The deviation is that of `covariance`, wider
+        where views contradict one another beyond the noise ("model error"), and with 0.05 % of
+        models that have one focal length for both axes, which real cameras do not have exactly. It
+        is infinite where nothing determines the focal length.
     flags : tuple of str
         From `epigauge.verdicts.FLAGS`.
     success : bool
@@ -256,21 +259,23 @@ def _judged(
 ) -> MetricUpgrade:
     """Return the result of an adjustment, with standard deviations and flags."""
     found = metric_of(bundle)
-    focal, known = _focal_lengths(found), None
+    focal, known = focal_lengths_of(found), None
     weights = np.where(bundle.rejected, 0.0, tracks.weights)
-    flags, turn_std = set(bundle.flags), 0.0
+    flags, turned = set(bundle.flags), 0.0
     std = np.full(len(focal), np.inf)
     try:
         known = covariance(tracks.weighted(weights), found, refine=fit.refined, backend=backend)
-        std = _focal_deviations(known)
+        std, erroneous = known_to(known, float(np.median(images.unit)))
+        if erroneous:
+            flags.add("model error")
     except ArgumentError:
         flags.add("undetermined")
     with np.errstate(invalid="ignore"):
         share = np.nan_to_num(std / focal, nan=np.inf)
     if (share > WEAK).any():
         flags.add("weak focal length")
-        turn_std = 0.0 if known is None else _turn_std(known)
-    flags |= set(motion_flags(found, images, turn_std))
+        turned = 0.0 if known is None else turn_std(known)
+    flags |= set(motion_flags(found, images, turned))
     if (share > OPEN).any():
         flags.add("undetermined")
     of_sample = np.isin(tracks.point, search.sample.points)
@@ -321,29 +326,6 @@ def _nothing(tracks: Tracks, images: Images, flags: tuple[str, ...]) -> MetricUp
         bundle=None,
         covariance=None,
     )
-
-
-def _focal_lengths(found: MetricReconstruction) -> Array:
-    """Return the focal length of each camera, the mean of both where there are two."""
-    places = list(camera_model(found.cameras.model).focal)
-    return np.asarray(found.cameras.params[:, places].mean(axis=1))
-
-
-def _focal_deviations(known: MetricCovariance) -> Array:
-    """Return the standard deviation of each focal length."""
-    cameras = known.reconstruction.cameras
-    model = camera_model(cameras.model)
-    share = np.zeros(len(model.adjusted))
-    share[list(model.focal)] = 1.0 / len(model.focal)
-    blocks = [known.intrinsics(c) for c in range(len(cameras))]
-    return np.sqrt([max(float(share @ block @ share), 0.0) for block in blocks])
-
-
-def _turn_std(known: MetricCovariance) -> float:
-    """Return the median standard deviation of the rotations, radians."""
-    n = known.reconstruction.n_views
-    variances = [np.trace(known.camera(i)[:3, :3]) for i in range(n)]
-    return float(np.sqrt(np.median(variances)))
 
 
 def _images(tracks: Tracks, image_size: ArrayLike, shared: bool | ArrayLike) -> Images:
