@@ -374,7 +374,8 @@ def minimize(
             iteration += 1
             trial = problem.evaluate(problem.retract(state, step))
             decrease = state.cost - trial.cost
-            norm = float(np.linalg.norm(step))
+            with np.errstate(over="ignore"):  # of nearly singular equations: it is rejected
+                norm = float(np.linalg.norm(step))
             accepted = decrease > 0.0
             stop = record(trial.cost, lam, norm, accepted)
             if accepted:
