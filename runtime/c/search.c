@@ -85,6 +85,13 @@ static inline sampson_t sampson(const double *F, double x1, double y1, double x2
     return at;
 }
 
+/* (e' x q') . (F q) */
+static inline double side_of(const sampson_t *at, const double *e2, double x2, double y2)
+{
+    return (e2[1] - e2[2] * y2) * at->a + (e2[2] * x2 - e2[0]) * at->b +
+           (e2[0] * y2 - e2[1] * x2) * at->c;
+}
+
 /* Sum of log(1 + scale^2 / (d^2 + floor^2)) over the matches q (4, m). */
 static double agreement(double scale2, double floor2, ptrdiff_t m, const double *q,
                         const double *F)
@@ -127,8 +134,7 @@ static void distances(const search_t *s, const double *F, double *squared)
     for (ptrdiff_t i = 0; i < s->m; ++i) {
         const sampson_t at = sampson(F, x1[i], y1[i], x2[i], y2[i]);
         squared[i] = at.C * at.C / (at.length2 + 1e-300);
-        side[i] = (e2[1] - e2[2] * y2[i]) * at.a + (e2[2] * x2[i] - e2[0]) * at.b +
-                  (e2[0] * y2[i] - e2[1] * x2[i]) * at.c;
+        side[i] = side_of(&at, e2, x2[i], y2[i]);
         votes += side[i] > 0.0 ? 1.0 : -1.0;
     }
     for (ptrdiff_t i = 0; i < s->m; ++i)
@@ -448,6 +454,32 @@ static void plane_and_parallax(search_t *s)
     free(rows);
     s->noise2 = 0.0;
     s->score = score(s, s->F);
+}
+
+/* Exact distances (m) of conditioned matches q1, q2 (2, m), and the sides (m) of the epipoles: all
+   of points in front of both cameras have one sign. */
+EG_EXPORT void eg_measure(ptrdiff_t m, const double *F, const double *q1, const double *q2,
+                          double *distances, double *side)
+{
+    const eg_options options = {.criterion = EG_REPROJECTION, .loss = EG_LINEAR};
+    double q[4 * EG_BLOCK], weights[EG_BLOCK], multiplier[EG_BLOCK], e2[3] = {0.0};
+    epipole(F, e2);
+    for (int i = 0; i < EG_BLOCK; ++i)
+        weights[i] = 1.0;
+    for (ptrdiff_t begin = 0; begin < m; begin += EG_BLOCK) {
+        const ptrdiff_t n = m - begin < EG_BLOCK ? m - begin : EG_BLOCK;
+        const double *x1 = q1 + begin, *y1 = x1 + m, *x2 = q2 + begin, *y2 = x2 + m;
+        eg_matches block = {n, q, weights, multiplier, distances + begin};
+        memcpy(q, x1, (size_t)n * sizeof(double));
+        memcpy(q + n, y1, (size_t)n * sizeof(double));
+        memcpy(q + 2 * n, x2, (size_t)n * sizeof(double));
+        memcpy(q + 3 * n, y2, (size_t)n * sizeof(double));
+        eg_distances(&block, &options, F);
+        for (ptrdiff_t i = 0; i < n; ++i) {
+            const sampson_t at = sampson(F, x1[i], y1[i], x2[i], y2[i]);
+            side[begin + i] = side_of(&at, e2, x2[i], y2[i]);
+        }
+    }
 }
 
 /* Share of the matches near one in either image that are near it in both: right matches have

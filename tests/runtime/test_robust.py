@@ -79,6 +79,35 @@ def test_noise_of_an_agreement_allows_for_the_seven_parameters_of_f(m, seed):
     assert variance == pytest.approx(2.0 * result.cost / (m - 7), rel=0.02)
 
 
+@pytest.mark.parametrize("wrong", [60, 120])
+def test_blunt_matches_are_not_cut_off(wrong):
+    # The scene is small in the image: three deviations of the noise are more
+    # than the distance within which raw matches agree by no chance.
+    scene, x1, x2, right = spoilt(wrong, distance=10.0, noise_px=0.9, seed=2)
+    result = eg.estimate_fundamental(x1, x2)
+    assert result.noise_px == pytest.approx(0.9, rel=0.25)
+    assert result.threshold_px > 2.5 * 0.9
+    assert np.mean(result.inlier[right]) > 0.95
+    best = eg.refine_fundamental(x1[right], x2[right])
+    assert error(result.F, scene) < 3.0 * error(best.F, scene)
+
+
+def test_compiled_and_numpy_distances_and_climbs_are_the_same():
+    if kernels.available()["c"]:
+        pytest.skip("no compiled library")
+    _, x1, x2, _ = spoilt(60, seed=3)
+    q = condition(x1, x2).forward(x1, x2)
+    one, other = (Consensus(kernels.table(name), *q) for name in ("c", "numpy"))
+    F = eg.fundamental_8point(*(np.ascontiguousarray(a.T) for a in q))
+    for a, b in zip(one.measured(F), other.measured(F), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-14)
+    assert 0 < np.count_nonzero(one.measured(F)[1])
+    best, same = (c.climb(c.judge(F, 0.05)) for c in (one, other))
+    assert best.score > one.judge(F, 0.05).score + 1.0
+    assert best.score == pytest.approx(same.score, rel=1e-6)
+    np.testing.assert_allclose(best.signed, same.signed, atol=1e-4)
+
+
 def test_score_of_an_agreement_does_not_depend_on_the_start_of_its_scale():
     scene, x1, x2, _ = spoilt(60)
     frame, consensus = consensus_of(x1, x2)

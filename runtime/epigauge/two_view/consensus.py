@@ -17,20 +17,25 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge.kernels import Table
 from epigauge.linear import Levenberg
-from epigauge.two_view.chance import CEILING
+from epigauge.two_view import native
 from epigauge.two_view.conditioning import RMS
 from epigauge.two_view.criteria import Reprojection
 from epigauge.two_view.eliminated import EliminatedProblem
-from epigauge.two_view.losses import Mixture
+from epigauge.two_view.losses import Loss, Mixture
 from epigauge.two_view.parameterizations import Block, Parameterization
 
-__all__ = ["RANGE", "Agreement", "Consensus"]
+__all__ = ["RANGE", "WIDEST", "Agreement", "Consensus"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 #: Range of a uniform coordinate with the RMS of conditioned ones.
 RANGE = 12.0**0.5 * RMS
+
+#: Largest distance of an inlier that is chosen without the caller, as a share of the range: 30 px
+#: in an image of 1000. It is twice that within which agreement of raw matches tells them from wrong
+#: ones (`chance.CEILING`): a limit there cuts the noise of blunt matches off, and bends F.
+WIDEST = 0.03
 
 #: Standard deviation of the noise, conditioned, below which distances are rounding.
 _FLOOR = 1e-12
@@ -47,6 +52,10 @@ _SIZES = (8, 12, 20, 40)
 _SUBSETS = 75
 _CLIMBERS = 5
 _ROUNDS = 5
+
+#: With a noise of no more than this share of the range (2.5 px in an image of 1000), and so many
+#: right matches, the likelihood has no other maximum that subsets of the right ones lead to.
+_NARROW, _PLENTY = 0.0025, 50
 
 #: Without a start: so many times the subsets of the smallest size, of which one in 256 is clean
 #: with half of the matches right; and the noise they are judged with, as shares of the range.
@@ -111,12 +120,11 @@ class Consensus:
     q1, q2 : ndarray, shape (2, m)
         Conditioned matches.
     widest : float
-        Largest standard deviation of the noise of right matches. The default is where agreement of
-        raw matches begins to say nothing.
+        Largest standard deviation of the noise of right matches.
     """
 
     def __init__(
-        self, kernels: Table, q1: Array, q2: Array, widest: float = CEILING * RANGE / 3.0
+        self, kernels: Table, q1: Array, q2: Array, widest: float = WIDEST * RANGE / 3.0
     ) -> None:
         self.widest = widest
         self.criterion = Reprojection(kernels, q1, q2)
@@ -155,35 +163,46 @@ class Consensus:
 
     def measured(self, F: Array) -> tuple[Array, Mask]:
         """Return exact distances, and which matches can lie in front of both cameras."""
-        signed = self.criterion.evaluate(F).signed
+        if self.criterion.kernels.compiled:
+            signed, side = native.measure(F, self.criterion.q1, self.criterion.q2)
+            oriented = side > 0.0 if np.sum(np.sign(side)) >= 0.0 else side < 0.0
+        else:
+            signed, oriented = self.criterion.evaluate(F).signed, self.oriented(F)
         # A match without a distance (beside a degenerate F) agrees with nothing.
-        return signed, self.oriented(F) & (np.abs(signed) < 1.0 / _FLOOR)
+        return signed, np.asarray(oriented & (np.abs(signed) < 1.0 / _FLOOR))
 
     def climb(self, start: Agreement) -> Agreement:
-        """Maximise the likelihood over F, sigma and share in turns."""
+        """Maximise the likelihood over F, sigma and share in turns.
+
+        F by least squares, each match weighing as it is probably right: expectation maximisation.
+        """
         best = start
         for _ in range(_CLIMBS):
-            problem = EliminatedProblem(
-                self.criterion,
-                self.chart,
-                best.oriented.astype(np.float64),
-                best.mixture,
-                exact=True,
-            )
-            stopping = lm.Stopping(ftol=1e-6, max_iter=10)
-            found = lm.minimize(
-                problem, self.chart.start(best.F), Levenberg(), lm.Classic(), stopping
-            )
-            trial = self.judge(found.state.F, best.sigma, best.share)
+            squared = np.where(best.oriented, best.signed, 0.0) ** 2
+            right = np.where(best.oriented, best.mixture(squared)[1], 0.0)
+            trial = self.judge(self._fitted(best.F, right), best.sigma, best.share)
             if not trial.score > best.score + _CLIMBED:
                 break
             best = trial
         return best
 
+    def _fitted(self, F: Array, weights: Array) -> Array:
+        """Return the geometry of least squares near one."""
+        stopping, start = lm.Stopping(ftol=1e-6, max_iter=10), self.chart.start(F)
+        criterion = self.criterion
+        if criterion.kernels.compiled:
+            choices = ("reprojection", "linear", "levenberg", True)
+            matches = (criterion.q1, criterion.q2, weights)
+            found = native.minimize(self.chart, start, matches, choices, 1.0, stopping, 1.0)
+            return np.asarray(found.state.F)
+        problem = EliminatedProblem(criterion, self.chart, weights, Loss("linear"), exact=True)
+        return np.asarray(lm.minimize(problem, start, Levenberg(), lm.Classic(), stopping).state.F)
+
     def search(self, starts: Iterable[Agreement], rng: np.random.Generator) -> Agreement:
-        """Climb from the starts and from what subsets of the right matches lead to."""
+        """Climb from the starts, and from what subsets of the right matches lead to."""
         best = max(map(self.climb, starts), key=_score)
-        for _ in range(_ROUNDS):
+        plain = best.sigma <= _NARROW * RANGE and best.share * len(best.signed) >= _PLENTY
+        for _ in range(0 if plain else _ROUNDS):
             pool = np.flatnonzero(best.inliers(3.0 * best.sigma)[self.few])
             if len(pool) <= _SIZES[0]:
                 break

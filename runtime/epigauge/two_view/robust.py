@@ -15,9 +15,8 @@ from epigauge._arguments import as_count, as_matches, as_positive, as_score
 from epigauge._logged import logged
 from epigauge._options import FrontEnd, RefineOptions, known_options
 from epigauge.errors import ArgumentError
-from epigauge.two_view.chance import CEILING
 from epigauge.two_view.conditioning import condition
-from epigauge.two_view.consensus import RANGE, Agreement, Consensus
+from epigauge.two_view.consensus import RANGE, WIDEST, Agreement, Consensus
 from epigauge.two_view.copies import earliest
 from epigauge.two_view.covariance import untruncated
 from epigauge.two_view.essential_consensus import EssentialConsensus
@@ -305,8 +304,8 @@ def _at_least(count: int, agreement: Agreement, limit: float) -> Mask:
 
 
 def _at_most(limit: float) -> float:
-    """Return a threshold that was not given, no larger than where agreement says something."""
-    return float(min(limit, CEILING * RANGE))
+    """Return a threshold that was not given, no larger than noise may be."""
+    return float(min(limit, WIDEST * RANGE))
 
 
 def _of_matches(options: dict[str, Any], m: int, rows: NDArray[np.intp]) -> dict[str, Any]:
