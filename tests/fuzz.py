@@ -13,6 +13,7 @@ import argparse
 import bz2
 import faulthandler
 import gzip
+import importlib.util
 import io
 import re
 import shlex
@@ -262,6 +263,7 @@ def kinds() -> dict[str, Kind]:
                 text,
             ),
             *scenes(Path(folder)),
+            *strangers(Path(folder), matches, many.tracks),
             *(
                 Kind(
                     f"b.txt.{name}",
@@ -304,11 +306,58 @@ def scenes(folder: Path) -> Iterator[Kind]:
     yield Kind("s.npz", whole, ("bundle FILE --refine pose",), (rearchived,))
 
 
+def strangers(folder: Path, matches: eg.Matches, tracks: eg.Tracks) -> Iterator[Kind]:
+    """Yield files as other programs write them."""
+    x1, x2 = matches.x1.astype(np.float32), matches.x2.astype(np.float32)
+    rows, nowhere = np.arange(len(x1)), np.full(3, -1)
+    features = {"keypoints0": x1, "keypoints1": np.vstack([x2, x2[:3] + 5.0])}
+    tables: dict[str, dict[str, np.ndarray]] = {
+        "loftr.npz": {"mkpts0": x1, "mkpts1": x2, "mconf": np.ones(len(x1))},
+        "lightglue.npz": features | {"matches": np.column_stack([rows, rows])},
+        "superglue.npz": features
+        | {"keypoints0": np.vstack([x1, x1[:3] - 5.0]), "matches0": np.append(rows, nowhere)},
+        "opencv.npz": {"pts1": x1[:, None], "pts2": x2[:, None], "mask": np.full(len(x1), 255)},
+    }
+    for name, arrays in tables.items():
+        np.savez(folder / name, **arrays)
+        yield Kind(name, (folder / name).read_bytes(), ("refine FILE",), (rearchived,))
+    np.save(folder / "m.npy", np.hstack([x1, x2]))
+    yield Kind("m.npy", (folder / "m.npy").read_bytes(), ("refine FILE",))
+    if importlib.util.find_spec("h5py"):
+        import h5py
+
+        with h5py.File(folder / "hloc.h5", "w") as file:
+            for name, x in (("keypoints0", x1), ("keypoints1", x2)):
+                file.create_dataset(f"a.jpg/b.jpg/{name}", data=x)
+        yield Kind("hloc.h5", (folder / "hloc.h5").read_bytes(), ("refine FILE",))
+
+    size = np.array([640, 480])
+    xy = (tracks.xy + 0.5 - size / 2) / size.max()
+    lines = ["OPENSFM_TRACKS_VERSION_v2"] + [
+        f"{view}.jpg\t{point}\t{k}\t{x!r}\t{y!r}\t0.004\t10\t20\t30\t-1\t-1"
+        for k, (view, point, (x, y)) in enumerate(
+            zip(tracks.view, tracks.point, xy.tolist(), strict=True)
+        )
+    ]
+    exif = {f"exif/{i}.jpg.exif": b'{"width": 640, "height": 480}' for i in range(tracks.n_views)}
+    text = (renumbered, relined)
+    good = "\n".join(lines).encode()
+    yield Kind("opensfm.csv", good, ("bundle FILE",), text, exif)
+    first = "exif/0.jpg.exif"
+    others = {name: content for name, content in exif.items() if name != first}
+    yield Kind(first, exif[first], ("bundle opensfm.csv",), text, others | {"opensfm.csv": good})
+    scene = metric_scene("bal", 5, n_points=12, noise_px=0.5)
+    eg.save_scene(folder / "s.out", *scene)
+    good = (folder / "s.out").read_bytes()
+    yield Kind("s.out", good, ("bundle FILE --refine pose",), text)
+
+
 def run(kind: Kind, data: bytes, command: str, folder: Path) -> Outcome:
     """Run a command on an input and judge what it does."""
-    folder /= kind.name.replace(".", "-")
+    folder /= re.sub(r"\W", "-", kind.name)
     folder.mkdir(exist_ok=True)
     for name, content in {kind.name: data, **kind.others}.items():
+        (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(content)
     arguments = command.replace("FILE", kind.name).split()
     arguments = [str(folder / a) if (folder / a).is_file() else a for a in arguments]
@@ -339,9 +388,10 @@ def _faults(result: object, data: bytes, folder: Path, kind: Kind) -> Iterator[s
         yield "refused without a reason"
     if result.exit_code == 0 and re.search(r"\b(nan|NaN|Infinity)\b", result.stdout):
         yield "NaN on stdout"
-    left = {path.name for path in folder.iterdir()} - {kind.name, *kind.others}
+    files = {path for path in folder.rglob("*") if path.is_file()}
+    left = files - {folder / name for name in (kind.name, *kind.others)}
     if left:
-        yield f"left behind: {left}"
+        yield f"left behind: {sorted(path.name for path in left)}"
 
 
 def fuzz(
@@ -385,7 +435,7 @@ def main() -> int:
             slowest[kind.name] = max(slowest.get(kind.name, 0.0), outcome.seconds)
             if outcome.fault:
                 options.failures.mkdir(exist_ok=True)
-                stem = f"{sum(codes.values()):06d}-{kind.name}"
+                stem = f"{sum(codes.values()):06d}-{kind.name.replace('/', '-')}"
                 (options.failures / stem).write_bytes(data)
                 why = f"{shlex.join(['epigauge', outcome.command])}\n{outcome.fault}\n"
                 (options.failures / f"{stem}.log").write_text(why)

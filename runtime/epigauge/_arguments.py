@@ -495,9 +495,10 @@ def as_real(name: str, value: ArrayLike, needed: str) -> Array:
 def as_double(array: NDArray[Any]) -> Array:
     """Convert to float64, at addresses where C may read it.
 
-    A long double beyond its range becomes infinite, to be refused later.
+    A long double beyond its range becomes infinite and a signalling NaN a quiet one, to be
+    refused later.
     """
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         return array.astype(np.float64, copy=not array.flags.aligned)
 
 

@@ -65,6 +65,15 @@ def test_numbers_beyond_measure_are_refused(tmp_path, weights, scale) -> None:
     assert (outcome.code, outcome.fault) == (2, "")
 
 
+def test_a_signalling_nan_is_refused(tmp_path) -> None:
+    table = np.hstack([_SCENE.x1, _SCENE.x2]).astype(np.float32)
+    table.view(np.uint32)[3, 2] = 0x7F800001
+    np.save(tmp_path / "m.npy", table)
+    data = (tmp_path / "m.npy").read_bytes()
+    outcome = fuzz.run(KINDS["m.npy"], data, "refine FILE", Path(tmp_path))
+    assert (outcome.code, outcome.fault) == (2, "")
+
+
 def test_a_camera_of_another_size_ends(tmp_path) -> None:
     """Its normal equations overflow, so that no lambda made them solvable."""
     scene = eg.multi_view_scene(n_views=4, n_points=15, visible=0.8, noise_px=0.5, seed=2)
