@@ -7,7 +7,7 @@
 
 const char *eg_digest(void)
 {
-    return "d9ef985095e20605";
+    return "b9ef590bed58b2a9";
 }
 
 const char *eg_sources(void)

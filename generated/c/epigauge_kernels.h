@@ -979,6 +979,35 @@ EG_EXPORT void eg_homography_normal(
     const double *EG_RESTRICT weight_array,
     double *EG_RESTRICT N);
 
+EG_EXPORT void eg_homography_foot(
+    ptrdiff_t n,
+    const double *EG_RESTRICT H,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT S1,
+    const double *EG_RESTRICT S2,
+    double *EG_RESTRICT foot,
+    double *EG_RESTRICT squared);
+
+EG_EXPORT void eg_homography_system(
+    ptrdiff_t n,
+    const double *EG_RESTRICT H,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT S1,
+    const double *EG_RESTRICT S2,
+    const double *EG_RESTRICT foot,
+    const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT N,
+    double *EG_RESTRICT gradient);
+
+EG_EXPORT void eg_four_points(
+    ptrdiff_t n,
+    const double *EG_RESTRICT sample1,
+    const double *EG_RESTRICT sample2,
+    double *EG_RESTRICT H,
+    double *EG_RESTRICT votes);
+
 EG_EXPORT void eg_plane_parallax(
     ptrdiff_t n,
     const double *EG_RESTRICT F,

@@ -249,6 +249,622 @@ EG_EXPORT void eg_homography_normal(
     N[44] = sum_N44;
 }
 
+/* Formula: the point p of image 1 with the least (q - p)^T S1^-1 (q - p) + (q' - h(p))^T
+   S2^-1 (q' - h(p)), h the homography, and that squared distance.
+   Inputs:  H (3, 3) shared, q1 (2,), q2 (2,), S1 (3,), S2 (3,)
+   Outputs: foot (2,), squared ()
+   Operations: 724, temporaries: 35. */
+EG_EXPORT void eg_homography_foot(
+    ptrdiff_t n,
+    const double *EG_RESTRICT H,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT S1,
+    const double *EG_RESTRICT S2,
+    double *EG_RESTRICT foot,
+    double *EG_RESTRICT squared)
+{
+    const double H00 = H[0];
+    const double H01 = H[1];
+    const double H02 = H[2];
+    const double H10 = H[3];
+    const double H11 = H[4];
+    const double H12 = H[5];
+    const double H20 = H[6];
+    const double H21 = H[7];
+    const double H22 = H[8];
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double q1_0 = q1[i];
+        const double q1_1 = q1[n + i];
+        const double q2_0 = q2[i];
+        const double q2_1 = q2[n + i];
+        const double S1_0 = S1[i];
+        const double S1_1 = S1[n + i];
+        const double S1_2 = S1[2*n + i];
+        const double S2_0 = S2[i];
+        const double S2_1 = S2[n + i];
+        const double S2_2 = S2[2*n + i];
+        double p0 = q1_0;
+        double p1 = q1_1;
+        {
+            const double t0 = 1.0/(H22 + H20*p0 + H21*p1);
+            const double h0 = t0*(H02 + H00*p0 + H01*p1);
+            const double b0 = t0*(H00 - H20*h0);
+            const double b1 = t0*(H01 - H21*h0);
+            const double t1 = S1_0*b0 + S1_1*b1;
+            const double h1 = t0*(H12 + H10*p0 + H11*p1);
+            const double b2 = t0*(H10 - H20*h1);
+            const double b3 = t0*(H11 - H21*h1);
+            const double t5 = q1_0 - p0;
+            const double t6 = q1_1 - p1;
+            const double e1 = q2_1 - h1 - b2*t5 - b3*t6;
+            const double t2 = S1_1*b0 + S1_2*b1;
+            const double s0 = S2_0 + b0*t1 + b1*t2;
+            const double s1 = S2_1 + b2*t1 + b3*t2;
+            const double t3 = S1_0*b2 + S1_1*b3;
+            const double t4 = S1_1*b2 + S1_2*b3;
+            const double s2 = S2_2 + b2*t3 + b3*t4;
+            const double t7 = 1.0/(s0*s2 - s1*s1);
+            const double e0 = q2_0 - h0 - b0*t5 - b1*t6;
+            const double t8 = e0*t7;
+            const double t10 = e1*s0*t7 - s1*t8;
+            const double t9 = s2*t8 - e1*s1*t7;
+            const double t11 = q1_0 + t1*t9 + t10*t3;
+            const double t12 = q1_1 + t10*t4 + t2*t9;
+            p0 = t11;
+            p1 = t12;
+        }
+        {
+            const double t0 = 1.0/(H22 + H20*p0 + H21*p1);
+            const double h0 = t0*(H02 + H00*p0 + H01*p1);
+            const double b0 = t0*(H00 - H20*h0);
+            const double b1 = t0*(H01 - H21*h0);
+            const double t1 = S1_0*b0 + S1_1*b1;
+            const double h1 = t0*(H12 + H10*p0 + H11*p1);
+            const double b2 = t0*(H10 - H20*h1);
+            const double b3 = t0*(H11 - H21*h1);
+            const double t5 = q1_0 - p0;
+            const double t6 = q1_1 - p1;
+            const double e1 = q2_1 - h1 - b2*t5 - b3*t6;
+            const double t2 = S1_1*b0 + S1_2*b1;
+            const double s0 = S2_0 + b0*t1 + b1*t2;
+            const double s1 = S2_1 + b2*t1 + b3*t2;
+            const double t3 = S1_0*b2 + S1_1*b3;
+            const double t4 = S1_1*b2 + S1_2*b3;
+            const double s2 = S2_2 + b2*t3 + b3*t4;
+            const double t7 = 1.0/(s0*s2 - s1*s1);
+            const double e0 = q2_0 - h0 - b0*t5 - b1*t6;
+            const double t8 = e0*t7;
+            const double t10 = e1*s0*t7 - s1*t8;
+            const double t9 = s2*t8 - e1*s1*t7;
+            const double t11 = q1_0 + t1*t9 + t10*t3;
+            const double t12 = q1_1 + t10*t4 + t2*t9;
+            p0 = t11;
+            p1 = t12;
+        }
+        {
+            const double t0 = 1.0/(H22 + H20*p0 + H21*p1);
+            const double h0 = t0*(H02 + H00*p0 + H01*p1);
+            const double b0 = t0*(H00 - H20*h0);
+            const double b1 = t0*(H01 - H21*h0);
+            const double t1 = S1_0*b0 + S1_1*b1;
+            const double h1 = t0*(H12 + H10*p0 + H11*p1);
+            const double b2 = t0*(H10 - H20*h1);
+            const double b3 = t0*(H11 - H21*h1);
+            const double t5 = q1_0 - p0;
+            const double t6 = q1_1 - p1;
+            const double e1 = q2_1 - h1 - b2*t5 - b3*t6;
+            const double t2 = S1_1*b0 + S1_2*b1;
+            const double s0 = S2_0 + b0*t1 + b1*t2;
+            const double s1 = S2_1 + b2*t1 + b3*t2;
+            const double t3 = S1_0*b2 + S1_1*b3;
+            const double t4 = S1_1*b2 + S1_2*b3;
+            const double s2 = S2_2 + b2*t3 + b3*t4;
+            const double t7 = 1.0/(s0*s2 - s1*s1);
+            const double e0 = q2_0 - h0 - b0*t5 - b1*t6;
+            const double t8 = e0*t7;
+            const double t10 = e1*s0*t7 - s1*t8;
+            const double t9 = s2*t8 - e1*s1*t7;
+            const double t11 = q1_0 + t1*t9 + t10*t3;
+            const double t12 = q1_1 + t10*t4 + t2*t9;
+            p0 = t11;
+            p1 = t12;
+        }
+        {
+            const double t0 = 1.0/(H22 + H20*p0 + H21*p1);
+            const double h0 = t0*(H02 + H00*p0 + H01*p1);
+            const double b0 = t0*(H00 - H20*h0);
+            const double b1 = t0*(H01 - H21*h0);
+            const double t1 = S1_0*b0 + S1_1*b1;
+            const double h1 = t0*(H12 + H10*p0 + H11*p1);
+            const double b2 = t0*(H10 - H20*h1);
+            const double b3 = t0*(H11 - H21*h1);
+            const double t5 = q1_0 - p0;
+            const double t6 = q1_1 - p1;
+            const double e1 = q2_1 - h1 - b2*t5 - b3*t6;
+            const double t2 = S1_1*b0 + S1_2*b1;
+            const double s0 = S2_0 + b0*t1 + b1*t2;
+            const double s1 = S2_1 + b2*t1 + b3*t2;
+            const double t3 = S1_0*b2 + S1_1*b3;
+            const double t4 = S1_1*b2 + S1_2*b3;
+            const double s2 = S2_2 + b2*t3 + b3*t4;
+            const double t7 = 1.0/(s0*s2 - s1*s1);
+            const double e0 = q2_0 - h0 - b0*t5 - b1*t6;
+            const double t8 = e0*t7;
+            const double t10 = e1*s0*t7 - s1*t8;
+            const double t9 = s2*t8 - e1*s1*t7;
+            const double t11 = q1_0 + t1*t9 + t10*t3;
+            const double t12 = q1_1 + t10*t4 + t2*t9;
+            p0 = t11;
+            p1 = t12;
+        }
+        {
+            const double t0 = 1.0/(H22 + H20*p0 + H21*p1);
+            const double h0 = t0*(H02 + H00*p0 + H01*p1);
+            const double b0 = t0*(H00 - H20*h0);
+            const double b1 = t0*(H01 - H21*h0);
+            const double t1 = S1_0*b0 + S1_1*b1;
+            const double h1 = t0*(H12 + H10*p0 + H11*p1);
+            const double b2 = t0*(H10 - H20*h1);
+            const double b3 = t0*(H11 - H21*h1);
+            const double t5 = q1_0 - p0;
+            const double t6 = q1_1 - p1;
+            const double e1 = q2_1 - h1 - b2*t5 - b3*t6;
+            const double t2 = S1_1*b0 + S1_2*b1;
+            const double s0 = S2_0 + b0*t1 + b1*t2;
+            const double s1 = S2_1 + b2*t1 + b3*t2;
+            const double t3 = S1_0*b2 + S1_1*b3;
+            const double t4 = S1_1*b2 + S1_2*b3;
+            const double s2 = S2_2 + b2*t3 + b3*t4;
+            const double t7 = 1.0/(s0*s2 - s1*s1);
+            const double e0 = q2_0 - h0 - b0*t5 - b1*t6;
+            const double t8 = e0*t7;
+            const double t10 = e1*s0*t7 - s1*t8;
+            const double t9 = s2*t8 - e1*s1*t7;
+            const double t11 = q1_0 + t1*t9 + t10*t3;
+            const double t12 = q1_1 + t10*t4 + t2*t9;
+            p0 = t11;
+            p1 = t12;
+        }
+        {
+            const double t0 = 1.0/(H22 + H20*p0 + H21*p1);
+            const double h0 = t0*(H02 + H00*p0 + H01*p1);
+            const double b0 = t0*(H00 - H20*h0);
+            const double b1 = t0*(H01 - H21*h0);
+            const double t1 = S1_0*b0 + S1_1*b1;
+            const double h1 = t0*(H12 + H10*p0 + H11*p1);
+            const double b2 = t0*(H10 - H20*h1);
+            const double b3 = t0*(H11 - H21*h1);
+            const double t5 = q1_0 - p0;
+            const double t6 = q1_1 - p1;
+            const double e1 = q2_1 - h1 - b2*t5 - b3*t6;
+            const double t2 = S1_1*b0 + S1_2*b1;
+            const double s0 = S2_0 + b0*t1 + b1*t2;
+            const double s1 = S2_1 + b2*t1 + b3*t2;
+            const double t3 = S1_0*b2 + S1_1*b3;
+            const double t4 = S1_1*b2 + S1_2*b3;
+            const double s2 = S2_2 + b2*t3 + b3*t4;
+            const double t7 = 1.0/(s0*s2 - s1*s1);
+            const double e0 = q2_0 - h0 - b0*t5 - b1*t6;
+            const double t8 = e0*t7;
+            const double t10 = e1*s0*t7 - s1*t8;
+            const double t9 = s2*t8 - e1*s1*t7;
+            const double t11 = q1_0 + t1*t9 + t10*t3;
+            const double t12 = q1_1 + t10*t4 + t2*t9;
+            p0 = t11;
+            p1 = t12;
+        }
+        {
+            const double t0 = 1.0/(H22 + H20*p0 + H21*p1);
+            const double h0 = t0*(H02 + H00*p0 + H01*p1);
+            const double b0 = t0*(H00 - H20*h0);
+            const double b1 = t0*(H01 - H21*h0);
+            const double t1 = S1_0*b0 + S1_1*b1;
+            const double h1 = t0*(H12 + H10*p0 + H11*p1);
+            const double b2 = t0*(H10 - H20*h1);
+            const double b3 = t0*(H11 - H21*h1);
+            const double t5 = q1_0 - p0;
+            const double t6 = q1_1 - p1;
+            const double e1 = q2_1 - h1 - b2*t5 - b3*t6;
+            const double t2 = S1_1*b0 + S1_2*b1;
+            const double s0 = S2_0 + b0*t1 + b1*t2;
+            const double s1 = S2_1 + b2*t1 + b3*t2;
+            const double t3 = S1_0*b2 + S1_1*b3;
+            const double t4 = S1_1*b2 + S1_2*b3;
+            const double s2 = S2_2 + b2*t3 + b3*t4;
+            const double t7 = 1.0/(s0*s2 - s1*s1);
+            const double e0 = q2_0 - h0 - b0*t5 - b1*t6;
+            const double t8 = e0*t7;
+            const double t10 = e1*s0*t7 - s1*t8;
+            const double t9 = s2*t8 - e1*s1*t7;
+            const double t11 = q1_0 + t1*t9 + t10*t3;
+            const double t12 = q1_1 + t10*t4 + t2*t9;
+            p0 = t11;
+            p1 = t12;
+        }
+        {
+            const double t0 = 1.0/(H22 + H20*p0 + H21*p1);
+            const double h0 = t0*(H02 + H00*p0 + H01*p1);
+            const double b0 = t0*(H00 - H20*h0);
+            const double b1 = t0*(H01 - H21*h0);
+            const double t1 = S1_0*b0 + S1_1*b1;
+            const double h1 = t0*(H12 + H10*p0 + H11*p1);
+            const double b2 = t0*(H10 - H20*h1);
+            const double b3 = t0*(H11 - H21*h1);
+            const double t5 = q1_0 - p0;
+            const double t6 = q1_1 - p1;
+            const double e1 = q2_1 - h1 - b2*t5 - b3*t6;
+            const double t2 = S1_1*b0 + S1_2*b1;
+            const double s0 = S2_0 + b0*t1 + b1*t2;
+            const double s1 = S2_1 + b2*t1 + b3*t2;
+            const double t3 = S1_0*b2 + S1_1*b3;
+            const double t4 = S1_1*b2 + S1_2*b3;
+            const double s2 = S2_2 + b2*t3 + b3*t4;
+            const double t7 = 1.0/(s0*s2 - s1*s1);
+            const double e0 = q2_0 - h0 - b0*t5 - b1*t6;
+            const double t8 = e0*t7;
+            const double t10 = e1*s0*t7 - s1*t8;
+            const double t9 = s2*t8 - e1*s1*t7;
+            const double t11 = q1_0 + t1*t9 + t10*t3;
+            const double t12 = q1_1 + t10*t4 + t2*t9;
+            p0 = t11;
+            p1 = t12;
+        }
+        const double t13 = q1_0 - p0;
+        const double t14 = q1_1 - p1;
+        const double t15 = 1.0/(S1_0*S1_2 - S1_1*S1_1);
+        const double t16 = t14*t15;
+        const double t17 = 1.0/(H22 + H20*p0 + H21*p1);
+        const double t18 = q2_0 - t17*(H02 + H00*p0 + H01*p1);
+        const double t19 = q2_1 - t17*(H12 + H10*p0 + H11*p1);
+        const double t20 = 1.0/(S2_0*S2_2 - S2_1*S2_1);
+        const double t21 = t19*t20;
+        foot[i] = p0;
+        foot[n + i] = p1;
+        squared[i] = t13*(S1_2*t13*t15 - S1_1*t16) + t14*(S1_0*t16 - S1_1*t13*t15) + t18*(S2_2*t18*t20 - S2_1*t21) + t19*(S2_0*t21 - S2_1*t18*t20);
+    }
+}
+
+/* Formula: J^T S^-1 J (upper triangle) and the gradient of half the squared distances by
+   vect(H), J = dh(p)/dH at the foot points p, S = S2 + B S1 B^T, B = dh/dp.
+   Inputs:  H (3, 3) shared, q1 (2,), q2 (2,), S1 (3,), S2 (3,), foot (2,), weight ()
+   Outputs: N (45,) summed, gradient (9,) summed
+   Operations: 248, temporaries: 67. */
+EG_EXPORT void eg_homography_system(
+    ptrdiff_t n,
+    const double *EG_RESTRICT H,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    const double *EG_RESTRICT S1,
+    const double *EG_RESTRICT S2,
+    const double *EG_RESTRICT foot,
+    const double *EG_RESTRICT weight_array,
+    double *EG_RESTRICT N,
+    double *EG_RESTRICT gradient)
+{
+    const double H00 = H[0];
+    const double H01 = H[1];
+    const double H02 = H[2];
+    const double H10 = H[3];
+    const double H11 = H[4];
+    const double H12 = H[5];
+    const double H20 = H[6];
+    const double H21 = H[7];
+    const double H22 = H[8];
+    double sum_N0 = 0.0;
+    double sum_N1 = 0.0;
+    double sum_N2 = 0.0;
+    double sum_N3 = 0.0;
+    double sum_N4 = 0.0;
+    double sum_N5 = 0.0;
+    double sum_N6 = 0.0;
+    double sum_N7 = 0.0;
+    double sum_N8 = 0.0;
+    double sum_N9 = 0.0;
+    double sum_N10 = 0.0;
+    double sum_N12 = 0.0;
+    double sum_N13 = 0.0;
+    double sum_N15 = 0.0;
+    double sum_N16 = 0.0;
+    double sum_N17 = 0.0;
+    double sum_N20 = 0.0;
+    double sum_N23 = 0.0;
+    double sum_N24 = 0.0;
+    double sum_N25 = 0.0;
+    double sum_N26 = 0.0;
+    double sum_N27 = 0.0;
+    double sum_N28 = 0.0;
+    double sum_N29 = 0.0;
+    double sum_N30 = 0.0;
+    double sum_N31 = 0.0;
+    double sum_N33 = 0.0;
+    double sum_N34 = 0.0;
+    double sum_N35 = 0.0;
+    double sum_N38 = 0.0;
+    double sum_N39 = 0.0;
+    double sum_N40 = 0.0;
+    double sum_N41 = 0.0;
+    double sum_N42 = 0.0;
+    double sum_N43 = 0.0;
+    double sum_N44 = 0.0;
+    double sum_gradient0 = 0.0;
+    double sum_gradient1 = 0.0;
+    double sum_gradient2 = 0.0;
+    double sum_gradient3 = 0.0;
+    double sum_gradient4 = 0.0;
+    double sum_gradient5 = 0.0;
+    double sum_gradient6 = 0.0;
+    double sum_gradient7 = 0.0;
+    double sum_gradient8 = 0.0;
+#ifndef _MSC_VER
+#pragma omp simd reduction(+ : sum_N0, sum_N1, sum_N2, sum_N3, sum_N4, sum_N5, sum_N6, sum_N7, sum_N8, sum_N9, sum_N10, sum_N12, sum_N13, sum_N15, sum_N16, sum_N17, sum_N20, sum_N23, sum_N24, sum_N25, sum_N26, sum_N27, sum_N28, sum_N29, sum_N30, sum_N31, sum_N33, sum_N34, sum_N35, sum_N38, sum_N39, sum_N40, sum_N41, sum_N42, sum_N43, sum_N44, sum_gradient0, sum_gradient1, sum_gradient2, sum_gradient3, sum_gradient4, sum_gradient5, sum_gradient6, sum_gradient7, sum_gradient8)
+#endif
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double q1_0 = q1[i];
+        const double q1_1 = q1[n + i];
+        const double q2_0 = q2[i];
+        const double q2_1 = q2[n + i];
+        const double S1_0 = S1[i];
+        const double S1_1 = S1[n + i];
+        const double S1_2 = S1[2*n + i];
+        const double S2_0 = S2[i];
+        const double S2_1 = S2[n + i];
+        const double S2_2 = S2[2*n + i];
+        const double foot0 = foot[i];
+        const double foot1 = foot[n + i];
+        const double weight = weight_array[i];
+        const double t0 = H22 + H20*foot0 + H21*foot1;
+        const double t1 = 1.0/t0;
+        const double h1 = t1*(H12 + H10*foot0 + H11*foot1);
+        const double b2 = t1*(H10 - H20*h1);
+        const double b3 = t1*(H11 - H21*h1);
+        const double s2 = S2_2 + b2*(S1_0*b2 + S1_1*b3) + b3*(S1_1*b2 + S1_2*b3);
+        const double t7 = 1.0/(t0*t0);
+        const double h0 = t1*(H02 + H00*foot0 + H01*foot1);
+        const double b0 = t1*(H00 - H20*h0);
+        const double b1 = t1*(H01 - H21*h0);
+        const double t2 = S1_0*b0 + S1_1*b1;
+        const double t3 = S1_1*b0 + S1_2*b1;
+        const double s0 = S2_0 + b0*t2 + b1*t3;
+        const double s1 = S2_1 + b2*t2 + b3*t3;
+        const double t8 = 1.0/(s0*s2 - s1*s1);
+        const double t9 = t8*weight;
+        const double t10 = t7*t9;
+        const double t11 = s2*t10;
+        const double t6 = foot0*foot0;
+        const double t12 = t11*t6;
+        const double t13 = foot0*t11;
+        const double t14 = foot1*t13;
+        const double t15 = s1*t10;
+        const double t16 = t15*t6;
+        const double t17 = foot0*t15;
+        const double t18 = foot1*t17;
+        const double t19 = -t18;
+        const double t20 = -t17;
+        const double t21 = foot0*foot1*h1*s1*t7*t8*weight - h0*t14;
+        const double t22 = foot0*h1*s1*t7*t8*weight - h0*t13;
+        const double t23 = foot1*foot1;
+        const double t24 = t11*t23;
+        const double t25 = foot1*t11;
+        const double t26 = t15*t23;
+        const double t27 = foot1*t15;
+        const double t28 = -t27;
+        const double t29 = foot1*h1*s1*t7*t8*weight - h0*t25;
+        const double t30 = s0*t10;
+        const double t31 = t30*t6;
+        const double t32 = foot0*t30;
+        const double t33 = foot1*t32;
+        const double t34 = h0*t18 - h1*t33;
+        const double t35 = h0*t17 - h1*t32;
+        const double t36 = t23*t30;
+        const double t37 = foot1*t30;
+        const double t38 = h0*t27 - h1*t37;
+        const double t39 = h0*t1;
+        const double t40 = s2*t39*t9;
+        const double t41 = t39*(foot0*h1*s1*t1*t8*weight - foot0*t40);
+        const double t42 = s1*t39*t9;
+        const double t43 = h1*t1;
+        const double t44 = s0*t43*t9;
+        const double t45 = t43*(foot0*t42 - foot0*t44);
+        const double t46 = t39*(foot1*h1*s1*t1*t8*weight - foot1*t40);
+        const double t47 = t43*(foot1*t42 - foot1*t44);
+        const double t4 = q1_0 - foot0;
+        const double t5 = q1_1 - foot1;
+        const double e1 = q2_1 - h1 - b2*t4 - b3*t5;
+        const double e0 = q2_0 - h0 - b0*t4 - b1*t5;
+        const double t48 = e0*t8;
+        const double t49 = s2*t48 - e1*s1*t8;
+        const double t50 = t1*weight;
+        const double t51 = t49*t50;
+        const double t52 = e1*s0*t8 - s1*t48;
+        const double t53 = t50*t52;
+        const double t54 = t39*t49*weight;
+        const double t55 = t43*t52*weight;
+        sum_N0 += t12;
+        sum_N1 += t14;
+        sum_N2 += t13;
+        sum_N3 += -t16;
+        sum_N4 += t19;
+        sum_N5 += t20;
+        sum_N6 += h1*s1*t6*t7*t8*weight - h0*t12;
+        sum_N7 += t21;
+        sum_N8 += t22;
+        sum_N9 += t24;
+        sum_N10 += t25;
+        sum_N12 += -t26;
+        sum_N13 += t28;
+        sum_N15 += h1*s1*t23*t7*t8*weight - h0*t24;
+        sum_N16 += t29;
+        sum_N17 += t11;
+        sum_N20 += -t15;
+        sum_N23 += h1*s1*t7*t8*weight - h0*t11;
+        sum_N24 += t31;
+        sum_N25 += t33;
+        sum_N26 += t32;
+        sum_N27 += h0*t16 - h1*t31;
+        sum_N28 += t34;
+        sum_N29 += t35;
+        sum_N30 += t36;
+        sum_N31 += t37;
+        sum_N33 += h0*t26 - h1*t36;
+        sum_N34 += t38;
+        sum_N35 += t30;
+        sum_N38 += h0*t15 - h1*t30;
+        sum_N39 += -foot0*t41 - foot0*t45;
+        sum_N40 += -foot1*t41 - foot1*t45;
+        sum_N41 += -t41 - t45;
+        sum_N42 += -foot1*t46 - foot1*t47;
+        sum_N43 += -t46 - t47;
+        sum_N44 += -t39*(h1*s1*t1*t8*weight - t40) - t43*(t42 - t44);
+        sum_gradient0 += -foot0*t51;
+        sum_gradient1 += -foot1*t51;
+        sum_gradient2 += -t51;
+        sum_gradient3 += -foot0*t53;
+        sum_gradient4 += -foot1*t53;
+        sum_gradient5 += -t53;
+        sum_gradient6 += foot0*t54 + foot0*t55;
+        sum_gradient7 += foot1*t54 + foot1*t55;
+        sum_gradient8 += t54 + t55;
+    }
+    N[0] = sum_N0;
+    N[1] = sum_N1;
+    N[2] = sum_N2;
+    N[3] = sum_N3;
+    N[4] = sum_N4;
+    N[5] = sum_N5;
+    N[6] = sum_N6;
+    N[7] = sum_N7;
+    N[8] = sum_N8;
+    N[9] = sum_N9;
+    N[10] = sum_N10;
+    N[11] = sum_N4;
+    N[12] = sum_N12;
+    N[13] = sum_N13;
+    N[14] = sum_N7;
+    N[15] = sum_N15;
+    N[16] = sum_N16;
+    N[17] = sum_N17;
+    N[18] = sum_N5;
+    N[19] = sum_N13;
+    N[20] = sum_N20;
+    N[21] = sum_N8;
+    N[22] = sum_N16;
+    N[23] = sum_N23;
+    N[24] = sum_N24;
+    N[25] = sum_N25;
+    N[26] = sum_N26;
+    N[27] = sum_N27;
+    N[28] = sum_N28;
+    N[29] = sum_N29;
+    N[30] = sum_N30;
+    N[31] = sum_N31;
+    N[32] = sum_N28;
+    N[33] = sum_N33;
+    N[34] = sum_N34;
+    N[35] = sum_N35;
+    N[36] = sum_N29;
+    N[37] = sum_N34;
+    N[38] = sum_N38;
+    N[39] = sum_N39;
+    N[40] = sum_N40;
+    N[41] = sum_N41;
+    N[42] = sum_N42;
+    N[43] = sum_N43;
+    N[44] = sum_N44;
+    gradient[0] = sum_gradient0;
+    gradient[1] = sum_gradient1;
+    gradient[2] = sum_gradient2;
+    gradient[3] = sum_gradient3;
+    gradient[4] = sum_gradient4;
+    gradient[5] = sum_gradient5;
+    gradient[6] = sum_gradient6;
+    gradient[7] = sum_gradient7;
+    gradient[8] = sum_gradient8;
+}
+
+/* Formula: H of four matches in closed form. Votes are 4 or -4 where all triangles of the
+   four keep, or all change, their orientation, as those do that one side of a plane shows.
+   Inputs:  sample1 (2, 4), sample2 (2, 4)
+   Outputs: H (3, 3), votes ()
+   Operations: 136, temporaries: 39. */
+EG_EXPORT void eg_four_points(
+    ptrdiff_t n,
+    const double *EG_RESTRICT sample1,
+    const double *EG_RESTRICT sample2,
+    double *EG_RESTRICT H,
+    double *EG_RESTRICT votes)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double sample1_00 = sample1[i];
+        const double sample1_01 = sample1[n + i];
+        const double sample1_02 = sample1[2*n + i];
+        const double sample1_03 = sample1[3*n + i];
+        const double sample1_10 = sample1[4*n + i];
+        const double sample1_11 = sample1[5*n + i];
+        const double sample1_12 = sample1[6*n + i];
+        const double sample1_13 = sample1[7*n + i];
+        const double sample2_00 = sample2[i];
+        const double sample2_01 = sample2[n + i];
+        const double sample2_02 = sample2[2*n + i];
+        const double sample2_03 = sample2[3*n + i];
+        const double sample2_10 = sample2[4*n + i];
+        const double sample2_11 = sample2[5*n + i];
+        const double sample2_12 = sample2[6*n + i];
+        const double sample2_13 = sample2[7*n + i];
+        const double t3 = sample1_02*sample1_13 - sample1_03*sample1_12;
+        const double t4 = sample1_00*sample1_12;
+        const double t5 = t4 - sample1_02*sample1_10;
+        const double t6 = sample1_03*sample1_10 - sample1_00*sample1_13;
+        const double w1_1 = -t3 - t5 - t6;
+        const double t0 = sample1_03*sample1_11;
+        const double t1 = sample1_01*sample1_13;
+        const double t7 = sample1_00*sample1_11 - sample1_01*sample1_10;
+        const double w1_2 = t1 + t6 + t7 - t0;
+        const double t10 = sample2_02*sample2_13 - sample2_03*sample2_12;
+        const double t11 = sample2_01*sample2_12 - sample2_02*sample2_11;
+        const double t8 = sample2_03*sample2_11;
+        const double t9 = sample2_01*sample2_13;
+        const double w2_0 = t10 + t11 + t8 - t9;
+        const double r0 = w1_1*w1_2*w2_0;
+        const double t15 = -sample1_12;
+        const double t16 = r0*(sample1_11 + t15);
+        const double t2 = sample1_01*sample1_12 - sample1_02*sample1_11;
+        const double w1_0 = t0 + t2 + t3 - t1;
+        const double t12 = sample2_00*sample2_12;
+        const double t13 = sample2_03*sample2_10 - sample2_00*sample2_13;
+        const double w2_1 = sample2_02*sample2_10 - t10 - t12 - t13;
+        const double r1 = w1_0*w1_2*w2_1;
+        const double t17 = r1*(-sample1_10 - t15);
+        const double t14 = sample2_00*sample2_11 - sample2_01*sample2_10;
+        const double w2_2 = t13 + t14 + t9 - t8;
+        const double r2 = w1_0*w1_1*w2_2;
+        const double t18 = r2*(sample1_10 - sample1_11);
+        const double t19 = -sample1_02;
+        const double t20 = r0*(-sample1_01 - t19);
+        const double t21 = r1*(sample1_00 + t19);
+        const double t22 = r2*(sample1_01 - sample1_00);
+        const double t23 = r0*t2;
+        const double t24 = -r1*t5;
+        const double t25 = r2*t7;
+        const double side0 = w1_0*w2_0;
+        const double side1 = w1_1*w2_1;
+        const double side2 = w1_2*w2_2;
+        const double side3 = (t2 + t7 + sample1_02*sample1_10 - t4)*(t11 + t14 + sample2_02*sample2_10 - t12);
+        H[i] = sample2_00*t16 + sample2_01*t17 + sample2_02*t18;
+        H[n + i] = sample2_00*t20 + sample2_01*t21 + sample2_02*t22;
+        H[2*n + i] = sample2_00*t23 + sample2_01*t24 + sample2_02*t25;
+        H[3*n + i] = sample2_10*t16 + sample2_11*t17 + sample2_12*t18;
+        H[4*n + i] = sample2_10*t20 + sample2_11*t21 + sample2_12*t22;
+        H[5*n + i] = sample2_10*t23 + sample2_11*t24 + sample2_12*t25;
+        H[6*n + i] = t16 + t17 + t18;
+        H[7*n + i] = t20 + t21 + t22;
+        H[8*n + i] = t23 + t24 + t25;
+        votes[i] = (side0 > 0.0 ? 1.0 : -1.0) + (side1 > 0.0 ? 1.0 : -1.0) + (side2 > 0.0 ? 1.0 : -1.0) + (side3 > 0.0 ? 1.0 : -1.0);
+    }
+}
+
 /* Formula: k with q' ~ [e']_x F q + k e' (plane and parallax): matches of a plane have k =
    v^T q. And the length that q' moves by a change of k.
    Inputs:  F (3, 3) shared, e2 (3,) shared, q1 (2,), q2 (2,)

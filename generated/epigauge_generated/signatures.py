@@ -857,6 +857,24 @@ SIGNATURES = {
         (Argument("N", (45,), False), ),
         "J^T J by vect(H) (upper triangle) of distances from a homography, (dc/dH)^T (dc/dq dc/dq^T)^-1 dc/dH with c = q' (h3 q) - (h1 q, h2 q) and q both points.",
     ),
+    "homography_foot": Signature(
+        "homography",
+        (Argument("H", (3, 3), False), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("S1", (3,), True), Argument("S2", (3,), True), ),
+        (Argument("foot", (2,), True), Argument("squared", (), True), ),
+        "the point p of image 1 with the least (q - p)^T S1^-1 (q - p) + (q' - h(p))^T S2^-1 (q' - h(p)), h the homography, and that squared distance.",
+    ),
+    "homography_system": Signature(
+        "homography",
+        (Argument("H", (3, 3), False), Argument("q1", (2,), True), Argument("q2", (2,), True), Argument("S1", (3,), True), Argument("S2", (3,), True), Argument("foot", (2,), True), Argument("weight", (), True), ),
+        (Argument("N", (45,), False), Argument("gradient", (9,), False), ),
+        "J^T S^-1 J (upper triangle) and the gradient of half the squared distances by vect(H), J = dh(p)/dH at the foot points p, S = S2 + B S1 B^T, B = dh/dp.",
+    ),
+    "four_points": Signature(
+        "homography",
+        (Argument("sample1", (2, 4), True), Argument("sample2", (2, 4), True), ),
+        (Argument("H", (3, 3), True), Argument("votes", (), True), ),
+        "H of four matches in closed form. Votes are 4 or -4 where all triangles of the four keep, or all change, their orientation, as those do that one side of a plane shows.",
+    ),
     "plane_parallax": Signature(
         "homography",
         (Argument("F", (3, 3), False), Argument("e2", (3,), False), Argument("q1", (2,), True), Argument("q2", (2,), True), ),

@@ -59,12 +59,16 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge.multi_view.uncertainty import ReconstructionCovariance, covariance
     from epigauge.scenes import MultiViewScene, TwoViewScene, multi_view_scene, two_view_scene
     from epigauge.two_view.batch import BATCH_STATUS, FundamentalBatch, refine_fundamental_batch
+    from epigauge.two_view.calibrated import estimate_essential
     from epigauge.two_view.geometry import (
         canonical_cameras,
         reprojection_distances,
         sampson_distances,
         triangulate,
     )
+    from epigauge.two_view.homography_refine import refine_homography
+    from epigauge.two_view.homography_result import HomographyResult
+    from epigauge.two_view.homography_search import estimate_homography
     from epigauge.two_view.initial import fundamental_7point, fundamental_8point
     from epigauge.two_view.refine import refine_fundamental
     from epigauge.two_view.result import FundamentalResult
@@ -90,6 +94,7 @@ __all__ = [
     "FocalLengths",
     "FundamentalBatch",
     "FundamentalResult",
+    "HomographyResult",
     "ImageMatches",
     "IntrinsicPrior",
     "Matches",
@@ -117,8 +122,10 @@ __all__ = [
     "compare",
     "covariance",
     "datasets",
+    "estimate_essential",
     "estimate_fundamental",
     "estimate_fundamental_batch",
+    "estimate_homography",
     "focal_lengths",
     "fundamental_7point",
     "fundamental_8point",
@@ -139,6 +146,7 @@ __all__ = [
     "multi_view_scene",
     "refine_fundamental",
     "refine_fundamental_batch",
+    "refine_homography",
     "reprojection_distances",
     "samples",
     "sampson_distances",
@@ -177,7 +185,11 @@ _WHERE = {
     "multi_view.uncertainty": "ReconstructionCovariance covariance",
     "scenes": "MultiViewScene TwoViewScene multi_view_scene two_view_scene",
     "two_view.batch": "BATCH_STATUS FundamentalBatch refine_fundamental_batch",
+    "two_view.calibrated": "estimate_essential",
     "two_view.geometry": ("canonical_cameras reprojection_distances sampson_distances triangulate"),
+    "two_view.homography_refine": "refine_homography",
+    "two_view.homography_result": "HomographyResult",
+    "two_view.homography_search": "estimate_homography",
     "two_view.initial": "fundamental_7point fundamental_8point",
     "two_view.refine": "refine_fundamental",
     "two_view.result": "FundamentalResult",

@@ -19,8 +19,8 @@ from typing import Literal
 
 __all__ = ["FLAGS", "Flag", "Kind", "explained", "ordered", "usable"]
 
-#: Kinds of result: a fundamental matrix, an essential one, a reconstruction from many views.
-Kind = Literal["F", "E", "views"]
+#: Kinds of result: a fundamental matrix, an essential one, a homography, many views.
+Kind = Literal["F", "E", "H", "views"]
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Flag:
     remedy : str
         What to do about it.
     spoils : tuple of str
-        Kinds of result that must not be used then: "F", "E", "views".
+        Kinds of result that must not be used then: "F", "E", "H", "views".
     """
 
     sentence: str
@@ -48,7 +48,7 @@ FLAGS = {
         "the matches agree no better than wrong ones do by chance: nothing says that both images "
         "show one rigid scene",
         "use photographs that overlap, or matches that are stricter (a smaller ratio)",
-        ("F", "E", "views"),
+        ("F", "E", "H", "views"),
     ),
     "still camera": Flag(
         "every point stays where it was: the camera did not move, or both images are one",
@@ -145,7 +145,7 @@ FLAGS = {
         "find the right matches with estimate_fundamental (`epigauge estimate`), or mark them "
         "(`--inliers`); in tracks, set the wrong ones aside with robust=True (`epigauge bundle "
         "--robust`)",
-        ("F", "E", "views"),
+        ("F", "E", "H", "views"),
     ),
     "outliers": Flag(
         "more residuals are beyond four standard deviations than noise explains: gross errors are "
@@ -228,7 +228,7 @@ def usable(names: Iterable[str], kind: Kind) -> bool:
     ----------
     names : iterable of str
         Flags that were raised.
-    kind : {"F", "E", "views"}
+    kind : {"F", "E", "H", "views"}
         What the result is.
 
     Returns

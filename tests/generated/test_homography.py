@@ -80,3 +80,15 @@ class TestHomography:
         h = H @ q + step * e2[:, None]
         length = np.linalg.norm(h[:2] / h[2] - q2, axis=0)
         np.testing.assert_allclose(step * gain, length, rtol=1e-3)
+
+    def test_four_matches_are_mapped_exactly(self, name) -> None:
+        table = kernels.table(name)
+        H, q1, _ = matches()
+        q2 = mapped(H, q1)
+        samples = [np.ascontiguousarray(q.reshape(2, 5, 4).transpose(0, 2, 1)) for q in (q1, q2)]
+        found, votes = table.four_points(*samples)
+        assert (np.abs(votes) == 4.0).all()
+        for k in range(5):
+            np.testing.assert_allclose(
+                mapped(found[:, :, k], samples[0][:, :, k]), samples[1][:, :, k], atol=1e-9
+            )

@@ -181,6 +181,341 @@ def homography_normal():
 
 
 @cache
+def homography_foot():
+    # Formula: the point p of image 1 with the least (q - p)^T S1^-1 (q - p) + (q' - h(p))^T
+    # S2^-1 (q' - h(p)), h the homography, and that squared distance.
+    # Inputs:  H (3, 3) shared, q1 (2,), q2 (2,), S1 (3,), S2 (3,)
+    # Outputs: foot (2,), squared ()
+    # Operations: 724, temporaries: 35.
+    H = ca.SX.sym("H", 3, 3)
+    H00 = H[0, 0]
+    H01 = H[0, 1]
+    H02 = H[0, 2]
+    H10 = H[1, 0]
+    H11 = H[1, 1]
+    H12 = H[1, 2]
+    H20 = H[2, 0]
+    H21 = H[2, 1]
+    H22 = H[2, 2]
+    q1 = ca.SX.sym("q1", 2, 1)
+    q1_0 = q1[0, 0]
+    q1_1 = q1[1, 0]
+    q2 = ca.SX.sym("q2", 2, 1)
+    q2_0 = q2[0, 0]
+    q2_1 = q2[1, 0]
+    S1 = ca.SX.sym("S1", 3, 1)
+    S1_0 = S1[0, 0]
+    S1_1 = S1[1, 0]
+    S1_2 = S1[2, 0]
+    S2 = ca.SX.sym("S2", 3, 1)
+    S2_0 = S2[0, 0]
+    S2_1 = S2[1, 0]
+    S2_2 = S2[2, 0]
+    p0 = q1_0
+    p1 = q1_1
+    for _ in range(8):
+        t0 = 1.0/(H22 + H20*p0 + H21*p1)
+        h0 = t0*(H02 + H00*p0 + H01*p1)
+        b0 = t0*(H00 - H20*h0)
+        b1 = t0*(H01 - H21*h0)
+        t1 = S1_0*b0 + S1_1*b1
+        h1 = t0*(H12 + H10*p0 + H11*p1)
+        b2 = t0*(H10 - H20*h1)
+        b3 = t0*(H11 - H21*h1)
+        t5 = q1_0 - p0
+        t6 = q1_1 - p1
+        e1 = q2_1 - h1 - b2*t5 - b3*t6
+        t2 = S1_1*b0 + S1_2*b1
+        s0 = S2_0 + b0*t1 + b1*t2
+        s1 = S2_1 + b2*t1 + b3*t2
+        t3 = S1_0*b2 + S1_1*b3
+        t4 = S1_1*b2 + S1_2*b3
+        s2 = S2_2 + b2*t3 + b3*t4
+        t7 = 1.0/(s0*s2 - s1*s1)
+        e0 = q2_0 - h0 - b0*t5 - b1*t6
+        t8 = e0*t7
+        t10 = e1*s0*t7 - s1*t8
+        t9 = s2*t8 - e1*s1*t7
+        t11 = q1_0 + t1*t9 + t10*t3
+        t12 = q1_1 + t10*t4 + t2*t9
+        p0 = t11
+        p1 = t12
+    t13 = q1_0 - p0
+    t14 = q1_1 - p1
+    t15 = 1.0/(S1_0*S1_2 - S1_1*S1_1)
+    t16 = t14*t15
+    t17 = 1.0/(H22 + H20*p0 + H21*p1)
+    t18 = q2_0 - t17*(H02 + H00*p0 + H01*p1)
+    t19 = q2_1 - t17*(H12 + H10*p0 + H11*p1)
+    t20 = 1.0/(S2_0*S2_2 - S2_1*S2_1)
+    t21 = t19*t20
+    foot = ca.SX(2, 1)
+    foot[0, 0] = p0
+    foot[1, 0] = p1
+    squared = ca.SX(1, 1)
+    squared[0, 0] = t13*(S1_2*t13*t15 - S1_1*t16) + t14*(S1_0*t16 - S1_1*t13*t15) + t18*(S2_2*t18*t20 - S2_1*t21) + t19*(S2_0*t21 - S2_1*t18*t20)
+    return ca.Function(
+        "homography_foot",
+        [H, q1, q2, S1, S2],
+        [foot, squared],
+        ["H", "q1", "q2", "S1", "S2"],
+        ["foot", "squared"],
+    )
+
+
+@cache
+def homography_system():
+    # Formula: J^T S^-1 J (upper triangle) and the gradient of half the squared distances by
+    # vect(H), J = dh(p)/dH at the foot points p, S = S2 + B S1 B^T, B = dh/dp.
+    # Inputs:  H (3, 3) shared, q1 (2,), q2 (2,), S1 (3,), S2 (3,), foot (2,), weight ()
+    # Outputs: N (45,) summed, gradient (9,) summed
+    # Operations: 248, temporaries: 67.
+    H = ca.SX.sym("H", 3, 3)
+    H00 = H[0, 0]
+    H01 = H[0, 1]
+    H02 = H[0, 2]
+    H10 = H[1, 0]
+    H11 = H[1, 1]
+    H12 = H[1, 2]
+    H20 = H[2, 0]
+    H21 = H[2, 1]
+    H22 = H[2, 2]
+    q1 = ca.SX.sym("q1", 2, 1)
+    q1_0 = q1[0, 0]
+    q1_1 = q1[1, 0]
+    q2 = ca.SX.sym("q2", 2, 1)
+    q2_0 = q2[0, 0]
+    q2_1 = q2[1, 0]
+    S1 = ca.SX.sym("S1", 3, 1)
+    S1_0 = S1[0, 0]
+    S1_1 = S1[1, 0]
+    S1_2 = S1[2, 0]
+    S2 = ca.SX.sym("S2", 3, 1)
+    S2_0 = S2[0, 0]
+    S2_1 = S2[1, 0]
+    S2_2 = S2[2, 0]
+    foot = ca.SX.sym("foot", 2, 1)
+    foot0 = foot[0, 0]
+    foot1 = foot[1, 0]
+    weight = ca.SX.sym("weight", 1, 1)
+    t0 = H22 + H20*foot0 + H21*foot1
+    t1 = 1.0/t0
+    h1 = t1*(H12 + H10*foot0 + H11*foot1)
+    b2 = t1*(H10 - H20*h1)
+    b3 = t1*(H11 - H21*h1)
+    s2 = S2_2 + b2*(S1_0*b2 + S1_1*b3) + b3*(S1_1*b2 + S1_2*b3)
+    t7 = 1.0/(t0*t0)
+    h0 = t1*(H02 + H00*foot0 + H01*foot1)
+    b0 = t1*(H00 - H20*h0)
+    b1 = t1*(H01 - H21*h0)
+    t2 = S1_0*b0 + S1_1*b1
+    t3 = S1_1*b0 + S1_2*b1
+    s0 = S2_0 + b0*t2 + b1*t3
+    s1 = S2_1 + b2*t2 + b3*t3
+    t8 = 1.0/(s0*s2 - s1*s1)
+    t9 = t8*weight
+    t10 = t7*t9
+    t11 = s2*t10
+    t6 = foot0*foot0
+    t12 = t11*t6
+    t13 = foot0*t11
+    t14 = foot1*t13
+    t15 = s1*t10
+    t16 = t15*t6
+    t17 = foot0*t15
+    t18 = foot1*t17
+    t19 = -t18
+    t20 = -t17
+    t21 = foot0*foot1*h1*s1*t7*t8*weight - h0*t14
+    t22 = foot0*h1*s1*t7*t8*weight - h0*t13
+    t23 = foot1*foot1
+    t24 = t11*t23
+    t25 = foot1*t11
+    t26 = t15*t23
+    t27 = foot1*t15
+    t28 = -t27
+    t29 = foot1*h1*s1*t7*t8*weight - h0*t25
+    t30 = s0*t10
+    t31 = t30*t6
+    t32 = foot0*t30
+    t33 = foot1*t32
+    t34 = h0*t18 - h1*t33
+    t35 = h0*t17 - h1*t32
+    t36 = t23*t30
+    t37 = foot1*t30
+    t38 = h0*t27 - h1*t37
+    t39 = h0*t1
+    t40 = s2*t39*t9
+    t41 = t39*(foot0*h1*s1*t1*t8*weight - foot0*t40)
+    t42 = s1*t39*t9
+    t43 = h1*t1
+    t44 = s0*t43*t9
+    t45 = t43*(foot0*t42 - foot0*t44)
+    t46 = t39*(foot1*h1*s1*t1*t8*weight - foot1*t40)
+    t47 = t43*(foot1*t42 - foot1*t44)
+    t4 = q1_0 - foot0
+    t5 = q1_1 - foot1
+    e1 = q2_1 - h1 - b2*t4 - b3*t5
+    e0 = q2_0 - h0 - b0*t4 - b1*t5
+    t48 = e0*t8
+    t49 = s2*t48 - e1*s1*t8
+    t50 = t1*weight
+    t51 = t49*t50
+    t52 = e1*s0*t8 - s1*t48
+    t53 = t50*t52
+    t54 = t39*t49*weight
+    t55 = t43*t52*weight
+    N = ca.SX(45, 1)
+    N[0, 0] = t12
+    N[1, 0] = t14
+    N[2, 0] = t13
+    N[3, 0] = -t16
+    N[4, 0] = t19
+    N[5, 0] = t20
+    N[6, 0] = h1*s1*t6*t7*t8*weight - h0*t12
+    N[7, 0] = t21
+    N[8, 0] = t22
+    N[9, 0] = t24
+    N[10, 0] = t25
+    N[11, 0] = t19
+    N[12, 0] = -t26
+    N[13, 0] = t28
+    N[14, 0] = t21
+    N[15, 0] = h1*s1*t23*t7*t8*weight - h0*t24
+    N[16, 0] = t29
+    N[17, 0] = t11
+    N[18, 0] = t20
+    N[19, 0] = t28
+    N[20, 0] = -t15
+    N[21, 0] = t22
+    N[22, 0] = t29
+    N[23, 0] = h1*s1*t7*t8*weight - h0*t11
+    N[24, 0] = t31
+    N[25, 0] = t33
+    N[26, 0] = t32
+    N[27, 0] = h0*t16 - h1*t31
+    N[28, 0] = t34
+    N[29, 0] = t35
+    N[30, 0] = t36
+    N[31, 0] = t37
+    N[32, 0] = t34
+    N[33, 0] = h0*t26 - h1*t36
+    N[34, 0] = t38
+    N[35, 0] = t30
+    N[36, 0] = t35
+    N[37, 0] = t38
+    N[38, 0] = h0*t15 - h1*t30
+    N[39, 0] = -foot0*t41 - foot0*t45
+    N[40, 0] = -foot1*t41 - foot1*t45
+    N[41, 0] = -t41 - t45
+    N[42, 0] = -foot1*t46 - foot1*t47
+    N[43, 0] = -t46 - t47
+    N[44, 0] = -t39*(h1*s1*t1*t8*weight - t40) - t43*(t42 - t44)
+    gradient = ca.SX(9, 1)
+    gradient[0, 0] = -foot0*t51
+    gradient[1, 0] = -foot1*t51
+    gradient[2, 0] = -t51
+    gradient[3, 0] = -foot0*t53
+    gradient[4, 0] = -foot1*t53
+    gradient[5, 0] = -t53
+    gradient[6, 0] = foot0*t54 + foot0*t55
+    gradient[7, 0] = foot1*t54 + foot1*t55
+    gradient[8, 0] = t54 + t55
+    return ca.Function(
+        "homography_system",
+        [H, q1, q2, S1, S2, foot, weight],
+        [N, gradient],
+        ["H", "q1", "q2", "S1", "S2", "foot", "weight"],
+        ["N", "gradient"],
+    )
+
+
+@cache
+def four_points():
+    # Formula: H of four matches in closed form. Votes are 4 or -4 where all triangles of the
+    # four keep, or all change, their orientation, as those do that one side of a plane shows.
+    # Inputs:  sample1 (2, 4), sample2 (2, 4)
+    # Outputs: H (3, 3), votes ()
+    # Operations: 136, temporaries: 39.
+    sample1 = ca.SX.sym("sample1", 2, 4)
+    sample1_00 = sample1[0, 0]
+    sample1_01 = sample1[0, 1]
+    sample1_02 = sample1[0, 2]
+    sample1_03 = sample1[0, 3]
+    sample1_10 = sample1[1, 0]
+    sample1_11 = sample1[1, 1]
+    sample1_12 = sample1[1, 2]
+    sample1_13 = sample1[1, 3]
+    sample2 = ca.SX.sym("sample2", 2, 4)
+    sample2_00 = sample2[0, 0]
+    sample2_01 = sample2[0, 1]
+    sample2_02 = sample2[0, 2]
+    sample2_03 = sample2[0, 3]
+    sample2_10 = sample2[1, 0]
+    sample2_11 = sample2[1, 1]
+    sample2_12 = sample2[1, 2]
+    sample2_13 = sample2[1, 3]
+    t3 = sample1_02*sample1_13 - sample1_03*sample1_12
+    t4 = sample1_00*sample1_12
+    t5 = t4 - sample1_02*sample1_10
+    t6 = sample1_03*sample1_10 - sample1_00*sample1_13
+    w1_1 = -t3 - t5 - t6
+    t0 = sample1_03*sample1_11
+    t1 = sample1_01*sample1_13
+    t7 = sample1_00*sample1_11 - sample1_01*sample1_10
+    w1_2 = t1 + t6 + t7 - t0
+    t10 = sample2_02*sample2_13 - sample2_03*sample2_12
+    t11 = sample2_01*sample2_12 - sample2_02*sample2_11
+    t8 = sample2_03*sample2_11
+    t9 = sample2_01*sample2_13
+    w2_0 = t10 + t11 + t8 - t9
+    r0 = w1_1*w1_2*w2_0
+    t15 = -sample1_12
+    t16 = r0*(sample1_11 + t15)
+    t2 = sample1_01*sample1_12 - sample1_02*sample1_11
+    w1_0 = t0 + t2 + t3 - t1
+    t12 = sample2_00*sample2_12
+    t13 = sample2_03*sample2_10 - sample2_00*sample2_13
+    w2_1 = sample2_02*sample2_10 - t10 - t12 - t13
+    r1 = w1_0*w1_2*w2_1
+    t17 = r1*(-sample1_10 - t15)
+    t14 = sample2_00*sample2_11 - sample2_01*sample2_10
+    w2_2 = t13 + t14 + t9 - t8
+    r2 = w1_0*w1_1*w2_2
+    t18 = r2*(sample1_10 - sample1_11)
+    t19 = -sample1_02
+    t20 = r0*(-sample1_01 - t19)
+    t21 = r1*(sample1_00 + t19)
+    t22 = r2*(sample1_01 - sample1_00)
+    t23 = r0*t2
+    t24 = -r1*t5
+    t25 = r2*t7
+    side0 = w1_0*w2_0
+    side1 = w1_1*w2_1
+    side2 = w1_2*w2_2
+    side3 = (t2 + t7 + sample1_02*sample1_10 - t4)*(t11 + t14 + sample2_02*sample2_10 - t12)
+    H = ca.SX(3, 3)
+    H[0, 0] = sample2_00*t16 + sample2_01*t17 + sample2_02*t18
+    H[0, 1] = sample2_00*t20 + sample2_01*t21 + sample2_02*t22
+    H[0, 2] = sample2_00*t23 + sample2_01*t24 + sample2_02*t25
+    H[1, 0] = sample2_10*t16 + sample2_11*t17 + sample2_12*t18
+    H[1, 1] = sample2_10*t20 + sample2_11*t21 + sample2_12*t22
+    H[1, 2] = sample2_10*t23 + sample2_11*t24 + sample2_12*t25
+    H[2, 0] = t16 + t17 + t18
+    H[2, 1] = t20 + t21 + t22
+    H[2, 2] = t23 + t24 + t25
+    votes = ca.SX(1, 1)
+    votes[0, 0] = ca.if_else(side0 > 0.0, 1.0, -1.0) + ca.if_else(side1 > 0.0, 1.0, -1.0) + ca.if_else(side2 > 0.0, 1.0, -1.0) + ca.if_else(side3 > 0.0, 1.0, -1.0)
+    return ca.Function(
+        "four_points",
+        [sample1, sample2],
+        [H, votes],
+        ["sample1", "sample2"],
+        ["H", "votes"],
+    )
+
+
+@cache
 def plane_parallax():
     # Formula: k with q' ~ [e']_x F q + k e' (plane and parallax): matches of a plane have k =
     # v^T q. And the length that q' moves by a change of k.

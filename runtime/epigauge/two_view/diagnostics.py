@@ -28,7 +28,7 @@ from epigauge.two_view.planes import (
 from epigauge.two_view.suspicion import WIDE, agreeing, is_common, is_inflated, is_suspicious
 from epigauge.verdicts import ordered
 
-__all__ = ["AFFINE", "PIXELS", "REDUNDANCY", "WEAK", "diagnose", "planar_bound"]
+__all__ = ["AFFINE", "PIXELS", "REDUNDANCY", "WEAK", "diagnose", "planar_bound", "still_bound"]
 
 #: A redundancy below this estimates the noise worse than to 1 / sqrt(2 * 8) = 25 %.
 REDUNDANCY = 8
@@ -159,6 +159,11 @@ def planar_bound(n: int, parameters: int) -> float:
     return (2 * n - 8) * ratio
 
 
+def still_bound(n: int) -> float:
+    """Return by how much, in units of the noise squared, no motion may fit worse than H does."""
+    return max(_CHI2_8, 2 * n * _STILL)
+
+
 def _plane(found: Evidence) -> dict[str, bool]:
     """Return the flags about simpler models than F."""
     noise2 = max(found.noise, ROUNDING) ** 2
@@ -186,7 +191,7 @@ def _plane(found: Evidence) -> dict[str, bool]:
             S_R = float(weights @ squared)
         n = len(weights)
         turned = (2 * n - 3) * bound >= (2 * n - 8) * S_R
-    still = explained and more <= max(_CHI2_8, 2 * len(weights) * _STILL) * noise2
+    still = explained and more <= still_bound(len(weights)) * noise2
     return {
         "still camera": still,
         "planar scene": explained and not still,

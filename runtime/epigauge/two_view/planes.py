@@ -31,6 +31,7 @@ __all__ = [
     "displacement",
     "judge_plane",
     "may_be_rotation",
+    "rotation_within",
     "share_on_a_plane",
 ]
 
@@ -299,7 +300,12 @@ def may_be_rotation(found: Evidence, H: Array, N: Array) -> bool:
     Then tr H = tr H^-1 at det H = 1. Both images must have the same coordinates for that: H is
     mapped from the units of the second image to those of the first.
     """
-    same = found.to_units1 @ np.linalg.inv(found.to_units2)
+    return rotation_within(found.to_units1, found.to_units2, found.noise, H, N)
+
+
+def rotation_within(to_units1: Array, to_units2: Array, noise: float, H: Array, N: Array) -> bool:
+    """Tell the same of a homography of any matches, of which `noise` is the deviation."""
+    same = to_units1 @ np.linalg.inv(to_units2)
     G = same @ H
     determinant = float(np.linalg.det(G))
     if determinant == 0.0:
@@ -312,7 +318,7 @@ def may_be_rotation(found: Evidence, H: Array, N: Array) -> bool:
     by_H = (same.T @ by_G).ravel()
     values, vectors = np.linalg.eigh(N)
     values = np.maximum(values, np.finfo(float).eps * values[-1])
-    variance = max(found.noise, ROUNDING) ** 2 * np.sum((vectors[:, 1:].T @ by_H) ** 2 / values[1:])
+    variance = max(noise, ROUNDING) ** 2 * np.sum((vectors[:, 1:].T @ by_H) ** 2 / values[1:])
     return bool(abs(trace - trace_inverse) <= WITHIN * np.sqrt(variance))
 
 

@@ -1,0 +1,311 @@
+"""The homography that most raw matches agree on, from samples of four matches.
+
+As in the search for F, a sample is judged by all matches without a threshold, the best is fitted to
+the matches around, and the noise and the share of right matches follow from the likelihood of the
+distances: those of right matches have two normal coordinates, wrong matches are uniform.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge import kernels
+from epigauge._arguments import as_count, as_matches, as_positive, as_score
+from epigauge._logged import logged
+from epigauge.errors import ArgumentError
+from epigauge.kernels import Table
+from epigauge.two_view.chance import CEILING, PAIRS, RANK, SIGNIFICANT, log10_false_alarms
+from epigauge.two_view.conditioning import condition
+from epigauge.two_view.consensus import RANGE
+from epigauge.two_view.copies import earliest
+from epigauge.two_view.evidence import ROUNDING
+from epigauge.two_view.homography import fit_homography
+from epigauge.two_view.homography_refine import LEAST, refine_homography, with_flags
+from epigauge.two_view.homography_result import HomographyResult
+from epigauge.two_view.search import SCALES, ranked
+
+__all__ = ["PlaneMixture", "chance_on_plane", "estimate_homography"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: Samples at least and at most, a batch of them, and how many times more than give one clean one.
+_LEAST, _MOST, _BATCH, _PATIENCE = 256, 8192, 64, 20.0
+
+#: Matches that judge all samples of a batch, and samples that all matches judge.
+_JUDGES, _FINALISTS = 192, 6
+
+#: Shares of the matches, best first, that samples are drawn from in turns.
+_POOLS = (1.0, 0.5, 0.25, 0.125)
+
+#: Widths of the fits around a sample in scales, and the part of the scale that is rounding.
+_WIDTHS, _FLOOR = (8.0, 3.0, 1.5), 0.01
+
+#: Distance that 99.9 % of right matches are within, in standard deviations of a coordinate, and
+#: what that leaves of the variance.
+_DEVIATIONS = math.sqrt(2.0 * math.log(1000.0))
+_KEPT = 1.0 - math.log(1000.0) / 999.0
+
+#: Steps of the maximisation of the likelihood, and rounds of inliers at most.
+_STEPS, _ROUNDS = 30, 10
+
+
+@dataclass(frozen=True)
+class PlaneMixture:
+    """Density of the distances to a homography: right matches and wrong ones.
+
+    Attributes
+    ----------
+    sigma : float
+        Standard deviation of a coordinate.
+    share : float
+        Share of right matches.
+    logarithm : float
+        Logarithm of the likelihood of all matches.
+    """
+
+    sigma: float
+    share: float
+    logarithm: float
+
+    @property
+    def even(self) -> float:
+        """Return the distance at which right and wrong are as likely; 0 where there is none."""
+        peak = self.share / (2.0 * math.pi * self.sigma**2)
+        odds = peak * RANGE**2 / max(1.0 - self.share, 1e-12)
+        return self.sigma * math.sqrt(max(2.0 * math.log(max(odds, 1e-300)), 0.0))
+
+    @staticmethod
+    def of(squared: Array, sigma: float, steps: int = _STEPS) -> PlaneMixture:
+        """Return the mixture of highest likelihood, by expectation and maximisation."""
+        share, m = 0.5, len(squared)
+        widest = CEILING * RANGE / 3.0
+        squared = np.minimum(squared, RANGE**2)
+        for step in range(steps + 1):
+            right = share / (2.0 * math.pi * sigma**2) * np.exp(-0.5 * squared / sigma**2)
+            total = right + (1.0 - share) / RANGE**2
+            if step == steps:
+                break
+            p = right / total
+            weight = max(float(np.sum(p)), 1e-12)
+            # Four matches fit exactly: they say nothing of the noise
+            free = max(2.0 * weight - 8.0, 1.0)
+            sigma = min(max(math.sqrt(float(p @ squared) / free), 1e-12), widest)
+            share = min(max(weight / m, 1e-3), 0.999)
+        return PlaneMixture(sigma, share, float(np.sum(np.log(total))))
+
+
+@logged
+def estimate_homography(
+    x1: ArrayLike,
+    x2: ArrayLike,
+    *,
+    threshold_px: float | Literal["auto"] = "auto",
+    score: ArrayLike | None = None,
+    seed: int = 0,
+    **options: Any,
+) -> HomographyResult:
+    """Find the homography of raw matches, gross errors and points off the plane among them.
+
+    Samples of four matches give starts; the best by all matches is fitted to the matches around.
+    The noise and the share of right matches follow from its distances, and `refine_homography` fits
+    the inliers until they stand still.
+
+    Parameters
+    ----------
+    x1, x2 : array_like, shape (m, 2)
+        At least four different matches in pixels; exact duplicates count once.
+    threshold_px : float or "auto"
+        Largest distance of an inlier. "auto" takes what 99.9 % of right matches are within, but no
+        more than where a match is as likely right as wrong.
+    score : array_like, shape (m,), optional
+        How promising each match is, the highest first; by default, matches are ranked by whether
+        their neighbours move alike.
+    seed : int
+        Of everything random: one seed, one answer.
+    **options
+        Of `refine_homography`, but for `H0`; `weights` and covariances are those of all matches.
+
+    Returns
+    -------
+    HomographyResult
+        As `refine_homography`, with the inliers. The flag "no common geometry" says that no more
+        matches agree than wrong ones would by chance.
+
+    Raises
+    ------
+    ArgumentError
+        On bad arguments.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import epigauge as eg
+    >>> rng = np.random.default_rng(0)
+    >>> x1 = rng.uniform(0.0, 1000.0, (100, 2))
+    >>> x2 = x1 @ [[0.9, -0.2], [0.2, 0.9]] + [30.0, -5.0] + 0.3 * rng.standard_normal((100, 2))
+    >>> x2[::3] = rng.uniform(0.0, 1000.0, (34, 2))  # every third match is wrong
+    >>> H, inlier = eg.estimate_homography(x1, x2)
+    >>> bool(inlier[::3].any()), int(np.count_nonzero(inlier))
+    (False, 66)
+    """
+    if "H0" in options:
+        raise ArgumentError("H0", "is given", "refine_homography, which starts from it")
+    x1, x2 = as_matches(x1, x2, at_least=LEAST, general_position=True)
+    seed = as_count("seed", seed, at_least=0)
+    threshold = None if threshold_px == "auto" else as_positive("threshold_px", threshold_px)
+    promise = None if score is None else as_score(score, len(x1))
+    first = earliest(x1, x2)
+    rows = np.flatnonzero(first == np.arange(len(x1)))
+    if len(rows) < LEAST:
+        raise ArgumentError("x1, x2", f"hold {len(rows)} different matches", "at least 4")
+    copies = np.searchsorted(rows, first)
+    y1, y2 = x1[rows], x2[rows]
+    frame = condition(y1, y2)
+    table, (q1, q2) = kernels.table(options.get("backend")), frame.forward(y1, y2)
+    order = ranked(table, q1, q2)
+    if promise is not None:
+        order = np.argsort(-promise[rows], kind="stable")
+    H = _searched(table, q1, q2, order, np.random.default_rng(seed))
+    mixture = PlaneMixture.of(_squares(table, H, q1, q2), SCALES[0])
+    result, limit = None, 0.0
+    tried: set[bytes] = set()
+    for _ in range(_ROUNDS):
+        squared = _squares(table, H, q1, q2)
+        mixture = PlaneMixture.of(squared, mixture.sigma)
+        limit = min(mixture.even, _DEVIATIONS * mixture.sigma, CEILING * RANGE)
+        limit = max(limit, ROUNDING) if threshold is None else threshold / frame.scale
+        inlier = squared <= limit**2
+        if np.count_nonzero(inlier) < LEAST:
+            inlier = np.zeros(len(rows), np.bool_)
+            inlier[np.argsort(squared, kind="stable")[:LEAST]] = True
+        if inlier.tobytes() in tried:
+            break
+        tried.add(inlier.tobytes())
+        chosen = _of_matches(options, len(x1), rows[inlier])
+        try:
+            result = refine_homography(y1[inlier], y2[inlier], frame_to_pixels(frame, H), **chosen)
+        except ArgumentError as error:
+            if error.argument not in ("x1", "x2") or result is not None:
+                raise
+            raise ArgumentError(
+                error.argument, "has all points that agree on one line", "spread matches"
+            ) from None
+        used = inlier
+        to1, to2 = frame.maps_from_pixels()
+        H = to2 @ result.H @ np.linalg.inv(to1)
+        H /= np.linalg.norm(H)
+    assert result is not None
+    alarms = log10_false_alarms(
+        len(rows), int(np.count_nonzero(used)), chance_on_plane(table, H, q1, q2, limit), LEAST
+    )
+    flags = ("no common geometry",) if alarms > SIGNIFICANT else ()
+    if threshold is None and options.get("noise_px") is None and np.isfinite(result.noise_px):
+        tails = 1.0 / math.sqrt(_KEPT)  # the threshold has cut them off
+        result = replace(
+            result, noise_px=result.noise_px * tails, covariance=result.covariance * tails**2
+        )
+    result = replace(result, inlier=used[copies], used=rows[used], threshold_px=limit * frame.scale)
+    return with_flags(result, flags)
+
+
+def frame_to_pixels(frame: Any, H: Array) -> Array:
+    """Return a conditioned homography in pixels."""
+    to1, to2 = frame.maps_from_pixels()
+    return np.asarray(np.linalg.inv(to2) @ H @ to1)
+
+
+def _of_matches(options: dict[str, Any], m: int, rows: NDArray[np.intp]) -> dict[str, Any]:
+    """Return the options with those that have one entry a match restricted to some."""
+    chosen = dict(options)
+    for name, dimensions in (("weights", 1), ("covariance1", 3), ("covariance2", 3)):
+        value = np.asarray(options.get(name))
+        if value.ndim == dimensions and len(value) == m:
+            chosen[name] = value[rows]
+    return chosen
+
+
+def _squares(table: Table, H: Array, q1: Array, q2: Array) -> Array:
+    """Return squared distances to first order; infinite where there are none."""
+    with np.errstate(all="ignore"):
+        squared = table.homography_squared(H, q1, q2)
+    return np.asarray(np.where(np.isfinite(squared), squared, np.inf))
+
+
+def _agreement(squared: Array) -> float:
+    """Return the score of a homography: as that of F, a mixture of all noises."""
+    scale2 = SCALES[0] ** 2
+    return float(np.sum(np.log1p(scale2 / (squared + _FLOOR * scale2))))
+
+
+def _searched(
+    table: Table, q1: Array, q2: Array, order: NDArray[np.intp], rng: np.random.Generator
+) -> Array:
+    """Return the best homography of samples, fitted to the matches around."""
+    m = q1.shape[1]
+    judges = order[
+        np.arange(min(m, _JUDGES)) * max((m + 1) // 2, min(m, _JUDGES)) // min(m, _JUDGES)
+    ]
+    j1, j2 = (np.ascontiguousarray(q[:, judges]) for q in (q1, q2))
+    pool = np.maximum(min(8, m), np.resize(_POOLS, _BATCH) * m).astype(int)
+    best, highest, done, needed = np.eye(3) / 3.0**0.5, -np.inf, 0, float(_MOST)
+    while done < needed:
+        rows = order[(rng.random((_BATCH, 4)) * pool[:, None]).astype(int)]
+        samples = (np.ascontiguousarray(q[:, rows].transpose(0, 2, 1)) for q in (q1, q2))
+        with np.errstate(all="ignore"):
+            H, votes = table.four_points(*samples)
+            H = H.transpose(2, 0, 1)
+            size = np.linalg.norm(H, axis=(1, 2))
+            good = (np.abs(votes) == 4.0) & np.isfinite(size) & (size > 1e-12)
+            candidates = H[good] / size[good, None, None]
+        done += _BATCH
+        if not len(candidates):
+            continue
+        first = np.array([_agreement(_squares(table, one, j1, j2)) for one in candidates])
+        finalists = candidates[np.argsort(-first, kind="stable")[:_FINALISTS]]
+        scores = [_agreement(_squares(table, one, q1, q2)) for one in finalists]
+        if max(scores) <= highest:
+            continue
+        highest = max(scores)
+        best, fitted = _improved(table, finalists[int(np.argmax(scores))], q1, q2, best)
+        near = np.count_nonzero(_squares(table, best, q1, q2) <= (3.0 * SCALES[0]) ** 2)
+        needed = min(max(_PATIENCE * (m / max(near, 4.0)) ** 4, _LEAST), _MOST)
+        highest = max(highest, fitted)
+    return best
+
+
+def _improved(table: Table, H: Array, q1: Array, q2: Array, before: Array) -> tuple[Array, float]:
+    """Fit to the matches around, wide first and then narrow; return the best, and its score."""
+    found = [before, H]
+    for width in SCALES[0] * np.array(_WIDTHS):
+        weights = np.exp(-0.5 * np.minimum(_squares(table, H, q1, q2) / width**2, 100.0))
+        if np.count_nonzero(weights > 0.1) < LEAST:
+            break
+        H = fit_homography(q1, q2, weights, table)[0]
+        found.append(H)
+    scores = [_agreement(_squares(table, one, q1, q2)) for one in found]
+    return found[int(np.argmax(scores))], max(scores)
+
+
+def chance_on_plane(table: Table, H: Array, q1: Array, q2: Array, limit: float) -> float:
+    """Return the probability that a wrong match is within a distance of a homography.
+
+    Wrong matches are made of the points themselves, as for F. Where few wrong pairs are so near,
+    the density further out tells, which grows as the square of the distance.
+    """
+    m = q1.shape[1]
+    rounds = min(-(-PAIRS // m), m - 1)
+    shifts = [1 + k * (m - 2) // max(rounds - 1, 1) for k in range(rounds)]
+    rolled = (np.ascontiguousarray(np.roll(q2, shift, axis=1)) for shift in shifts)
+    squared = np.concatenate([_squares(table, H, q1, one) for one in rolled])
+    near = int(np.count_nonzero(squared <= limit**2))
+    if near >= RANK or near == len(squared):
+        return near / len(squared)
+    rank = min(RANK, len(squared)) - 1
+    wide = float(np.partition(squared, rank)[rank])
+    return (rank + 1) / len(squared) * min(limit**2 / wide, 1.0) if wide > 0.0 else 1.0
