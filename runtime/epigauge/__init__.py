@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
         casadi,
         colmap,
         datasets,
+        distributed,
         interop,
         kernels,
         samples,
@@ -122,6 +123,7 @@ __all__ = [
     "compare",
     "covariance",
     "datasets",
+    "distributed",
     "estimate_essential",
     "estimate_fundamental",
     "estimate_fundamental_batch",
@@ -204,6 +206,7 @@ _MODULES = {
         name: name
         for name in ("errors", "images", "io", "lm", "plots", "reports", "samples", "scenes")
     },
+    "distributed": "distributed",
     "verdicts": "verdicts",
     "gauge": "multi_view.gauge",
 }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,9 +16,26 @@ from epigauge.cameras import CameraModel
 from epigauge.kernels import Table
 from epigauge.two_view.losses import Loss
 
-__all__ = ["linearizer_for"]
+__all__ = ["Elsewhere", "linearizer_for"]
 
 Array = NDArray[np.float64]
+
+
+class Elsewhere(Protocol):
+    """Processes that observations are evaluated by, instead of this one."""
+
+    def linearizer(
+        self,
+        model: CameraModel,
+        kernels: Table,
+        graph: ObservationGraph,
+        q: Array,
+        weights: Array,
+        loss: Loss,
+        ties: Ties | None,
+        whitening: Array | None,
+    ) -> Linearizer:
+        """Return what evaluates observations there; arguments as of `linearizer_for`."""
 
 
 def linearizer_for(
@@ -26,7 +45,7 @@ def linearizer_for(
     q: Array,
     weights: Array,
     loss: Loss,
-    workers: int = 1,
+    workers: int | Elsewhere = 1,
     ties: Ties | None = None,
     whitening: Array | None = None,
 ) -> Linearizer:
@@ -46,13 +65,15 @@ def linearizer_for(
         Factor of each squared residual.
     loss : Loss
         Applied to each squared residual.
-    workers : int
-        Threads to use where the back end can.
+    workers : int or Elsewhere
+        Threads to use where the back end can, or other processes.
     ties : Ties, optional
         What own tangents are made of: entries of a camera's that are always zero need no work.
     whitening : ndarray, shape (2, 2, N), optional
         What residuals are multiplied by; the compiled evaluation knows none.
     """
+    if not isinstance(workers, int):
+        return workers.linearizer(model, kernels, graph, q, weights, loss, ties, whitening)
     if kernels.compiled and whitening is None:
         used = None if ties is None else ties.used
         return NativeLinearizer(model, graph, q, weights, loss, workers, used)

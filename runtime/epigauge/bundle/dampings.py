@@ -25,6 +25,7 @@ __all__ = [
     "Levenberg",
     "Marquardt",
     "PseudoInverse",
+    "lifted",
 ]
 
 Array = NDArray[np.float64]
@@ -116,7 +117,7 @@ class Covariant(ByMatrix):
             )
         points = point_damping(system.model, system.V, None)
         if not system.model.metric:
-            return Blocks(_lifted(system.U), np.ones(0), _lifted(points))
+            return Blocks(lifted(system.U), np.ones(0), lifted(points))
         diagonal = np.einsum("nii->ni", system.U)
         # An unknown that moves no image, as the distortion of points on the axis: of the others'.
         diagonal = np.maximum(diagonal, _SMALL * diagonal.max(axis=0))
@@ -233,7 +234,7 @@ def _diagonals(blocks: Array) -> Array:
     return np.asarray(diagonals[:, :, None] * np.eye(blocks.shape[1]))
 
 
-def _lifted(blocks: Array) -> Array:
+def lifted(blocks: Array) -> Array:
     """Return blocks that a flat scene does not leave singular; else the same to rounding."""
     mean = np.einsum("nii->n", blocks) / blocks.shape[1]
     return np.asarray(blocks + (_SMALL * mean)[:, None, None] * np.eye(blocks.shape[1]))

@@ -15,7 +15,7 @@ from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.skyline import Skyline, narrow
 from epigauge.two_view.losses import LOSSES, Loss
 
-__all__ = ["LaneLayout", "Range"]
+__all__ = ["FULL", "LaneLayout", "Range"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -25,7 +25,7 @@ Range = tuple[int, int]
 _ROWS, _MOST_LANES = 384, 56
 
 #: Cameras of which a full matrix is factored in no time.
-_FULL = 10
+FULL = 10
 
 #: What the passes over an observation cost, in pairs of observations, and what a point costs in a
 #: pass, in observations.
@@ -49,6 +49,8 @@ class LaneLayout:
         Row of the camera model in the C library's table, or `FACTORED`.
     columns : ndarray of int32, shape (k,)
         Entries of a camera's tangent that are computed with.
+    heaviest : float, optional
+        Largest weight of all observations, where these are a part of them.
 
     Attributes
     ----------
@@ -67,6 +69,7 @@ class LaneLayout:
         weights: Array,
         model: int,
         columns: NDArray[np.int32],
+        heaviest: float | None = None,
     ) -> None:
         self._graph, self._q, self._weights, self.columns = graph, q, weights, columns
         counts = np.diff(graph.first)
@@ -84,7 +87,7 @@ class LaneLayout:
             graph.n_points,
             len(self.lanes) - 1,
             *map(address, arrays),
-            least=LEAST_WEIGHT * float(weights.max()),
+            least=LEAST_WEIGHT * float(weights.max() if heaviest is None else heaviest),
             model=model,
             width=len(columns),
             columns=address(columns),
@@ -113,6 +116,10 @@ class LaneLayout:
         count = max(1, min(count, int(pairs.sum() / _SHARE)))
         return _ranges(rows + _POINT * lanes, count), _ranges(pairs, count)
 
+    def settle(self, skyline: Skyline) -> None:
+        """Take a skyline, and leave the cameras in the order that they have."""
+        self._skyline = skyline
+
     @property
     def skyline(self) -> Skyline:
         """Return the skyline of pairs; the cameras get the order that narrows it when first asked.
@@ -121,12 +128,7 @@ class LaneLayout:
         """
         if self._skyline is None:
             graph, n = self._graph, self._graph.n_views
-            self._skyline = Skyline.full(n)
-            if n > _FULL:
-                # The lowest view that shares a point with each.
-                lowest = np.arange(n)
-                np.minimum.at(lowest, graph.view, graph.view[graph.first[:-1]][graph.point])
-                self._skyline = Skyline.of(lowest)
+            self._skyline = Skyline.full(n) if n <= FULL else Skyline.of(graph.lowest)
             if self._skyline.wide:
                 together = np.zeros((n, n), np.bool_)
                 function("bundle_neighbours")(ctypes.byref(self._bundle), address(together))

@@ -42,7 +42,7 @@ from epigauge.cameras import CameraModel
 from epigauge.errors import ArgumentError
 from epigauge.two_view.losses import Loss
 
-__all__ = ["NativeLinearizer"]
+__all__ = ["NativeCoupling", "NativeLinearizer", "NativePairs", "is_direct"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -78,6 +78,8 @@ class NativeLinearizer:
     factored : bool, optional
         Whether cameras of homogeneous points, whose tangent is their matrix, go by the factors of
         their Jacobian; by default they do.
+    heaviest : float, optional
+        Largest weight of all observations, where these are a part of them.
     """
 
     def __init__(
@@ -90,6 +92,7 @@ class NativeLinearizer:
         workers: int = 1,
         columns: ArrayLike | None = None,
         factored: bool | None = None,
+        heaviest: float | None = None,
     ) -> None:
         self.model, self.graph, self.loss = model, graph, loss
         self.q, self.weights = q, weights
@@ -106,7 +109,8 @@ class NativeLinearizer:
             )
         #: None where all entries are computed with.
         self._used: Indices | None = None if len(used) == len(whole) else used
-        self.layout = LaneLayout(graph, q, weights, row, used.astype(np.int32))
+        self.layout = LaneLayout(graph, q, weights, row, used.astype(np.int32), heaviest)
+        self._heaviest = heaviest
         self._bundle = self.layout.bundle(loss)
         self.reference = ctypes.byref(self._bundle)
         camera_sums, self.pair_sums = ctypes.c_ssize_t(), Blocks()
@@ -122,7 +126,7 @@ class NativeLinearizer:
         """Pickle what it was made from: addresses and threads mean nothing elsewhere."""
         workers = max(len(self._passes), len(self._pairs))
         own = self.model, self.graph, self.q, self.weights, self.loss
-        return NativeLinearizer, (*own, workers, self._used, self.factored)
+        return NativeLinearizer, (*own, workers, self._used, self.factored, self._heaviest)
 
     def __copy__(self) -> NativeLinearizer:
         other = object.__new__(type(self))
@@ -164,9 +168,7 @@ class NativeLinearizer:
     @cached_property
     def direct(self) -> bool:
         """Tell whether the reduced system is to be stored and factored."""
-        most = DENSE_CAMERAS * (DENSE_CAMERAS + 1) // 2
-        work, few = self.skyline.work, self.skyline.blocks <= most
-        return few and work <= max(_QUICK, _PATIENCE * len(self.graph.point))
+        return is_direct(self.skyline, len(self.graph.point))
 
     def with_loss(self, loss: Loss) -> NativeLinearizer:
         """Return the same observations with another loss."""
@@ -529,6 +531,12 @@ class NativeFactor:
     def inverse(self) -> NativeInverse:
         """Return the blocks of the inverse of all pairs of views, of the direct route."""
         return NativeInverse(self.linearizer, self.skyline, self.inner.inverse())
+
+
+def is_direct(skyline: Skyline, n_observations: int) -> bool:
+    """Tell whether a reduced system is to be stored and factored."""
+    few = skyline.blocks <= DENSE_CAMERAS * (DENSE_CAMERAS + 1) // 2
+    return few and skyline.work <= max(_QUICK, _PATIENCE * n_observations)
 
 
 def _together(pool: ThreadPoolExecutor | None, calls: list[Callable[[], Any]]) -> list[Any]:

@@ -59,6 +59,8 @@ class NumpyLinearizer:
         Applied to each squared residual.
     whitening : ndarray, shape (2, 2, N), or None
         What residuals are multiplied by, where their coordinates are not measured alike.
+    heaviest : float, optional
+        Largest weight of all observations, where these are a part of them.
     """
 
     model: CameraModel
@@ -68,6 +70,7 @@ class NumpyLinearizer:
     weights: Array
     loss: Loss
     whitening: Array | None = None
+    heaviest: float | None = None
 
     def with_loss(self, loss: Loss) -> NumpyLinearizer:
         """Return the same observations with another loss."""
@@ -196,7 +199,8 @@ class NumpyLinearizer:
     def _effective(self, weights: Array, r: Array) -> tuple[Array, Array]:
         """Return weighted robust squares of residuals, and weights in the normal equations."""
         rho, first, _ = self.loss(np.sum(r**2, axis=0))
-        least = LEAST_WEIGHT * float(np.max(self.weights))
+        heaviest = np.max(self.weights) if self.heaviest is None else self.heaviest
+        least = LEAST_WEIGHT * float(heaviest)
         return weights * rho, np.maximum(weights * first, least)
 
     def _sums(self, Z_camera: Array, Z_point: Array) -> tuple[Array, Array]:

@@ -49,6 +49,13 @@ class ObservationGraph:
         return np.searchsorted(self.view[self.by_view], np.arange(self.n_views + 1))
 
     @cached_property
+    def lowest(self) -> Indices:
+        """Return the lowest view that shares a point with each, (n,)."""
+        found = np.arange(self.n_views)
+        np.minimum.at(found, self.view, self.view[self.first[:-1]][self.point])
+        return found
+
+    @cached_property
     def simple(self) -> ObservationGraph:
         """Return the graph without repetitions: one edge a pair of view and point."""
         if self.first_of_edge is None:

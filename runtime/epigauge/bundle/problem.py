@@ -18,7 +18,7 @@ from epigauge.bundle.priors import Priors
 from epigauge.bundle.solve import BundleSystem, Step
 from epigauge.cameras import MAX_FOCAL, MIN_FOCAL, CameraModel
 
-__all__ = ["BundleProblem", "BundleState", "Estimate"]
+__all__ = ["BundleProblem", "BundleState", "Estimate", "in_range"]
 
 Array = NDArray[np.float64]
 
@@ -114,6 +114,10 @@ class BundleProblem:
         system = None if done.normal is None else self._system(done.normal, found)
         return lm.Outcome(BundleState(found, done.cost), system, *done.counts, done.history)
 
+    def fetched(self, outcome: lm.Outcome[BundleState]) -> lm.Outcome[BundleState]:
+        """Return an outcome with all that belongs to points here, were they elsewhere."""
+        return outcome
+
     def evaluate(self, estimate: Estimate) -> BundleState:
         """Return the state of an estimate; a cost of infinity where it has none."""
         costs = estimate.point_costs
@@ -158,7 +162,7 @@ class BundleProblem:
         points, steps = state.points + step.points, state.estimate.steps + 1
         cameras, points = self.freedom.settled(cameras, points, steps)
         if self.model.homogeneous:
-            cameras, points = _in_range(cameras), _in_range(points)
+            cameras, points = in_range(cameras), in_range(points)
         if self.refinement is None:
             return Estimate(cameras, points, steps)
         refined, costs = self.refined(cameras, points)
@@ -180,7 +184,7 @@ class BundleProblem:
         return bool(np.all((focal >= MIN_FOCAL) & (focal <= MAX_FOCAL)))
 
 
-def _in_range(vectors: Array) -> Array:
+def in_range(vectors: Array) -> Array:
     """Return homogeneous vectors, those whose scale has run away as unit vectors."""
     sizes = np.abs(vectors).max(axis=1, keepdims=True)
     away = ((sizes > _LARGE) & (sizes < np.inf)) | ((sizes < 1.0 / _LARGE) & (sizes > 0.0))

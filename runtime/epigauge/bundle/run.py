@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from epigauge import lm
 from epigauge.bundle import far
-from epigauge.bundle.backends import linearizer_for
+from epigauge.bundle.backends import Elsewhere, linearizer_for
 from epigauge.bundle.dampings import (
     DAMPINGS,
     LAM_FLOOR_METRIC,
@@ -56,7 +56,7 @@ def bundle_problem(
     loss: Loss | None = None,
     *,
     embedded: bool = False,
-    workers: int = 1,
+    workers: int | Elsewhere = 1,
     whitening: Array | None = None,
     **parts: Any,
 ) -> BundleProblem:
@@ -76,8 +76,8 @@ def bundle_problem(
         Applied to each squared residual.
     embedded : bool
         Re-triangulate the points after each step.
-    workers : int
-        Threads to use where the back end can.
+    workers : int or Elsewhere
+        Threads to use where the back end can, or other processes.
     whitening : ndarray, shape (2, 2, N), optional
         What residuals are multiplied by.
     **parts
@@ -123,7 +123,7 @@ def minimized(
     schedule: Callable[[], lm.Schedule],
     loss: Loss,
     stopping: lm.Stopping,
-    workers: int,
+    workers: int | Elsewhere,
     callback: Callable[[lm.Row], object] | None,
 ) -> tuple[lm.Outcome[BundleState], Array, Array]:
     """Minimise by a method; return how it ended, and cameras and points in the gauge of the result.
@@ -211,10 +211,15 @@ def minimized(
             whitening=job.whitening,
         )
         # Points jump alike whatever the basis, but only in the one chosen here: in no gauge.
+        # Where points are elsewhere they can stay there from step to step.
+        resident = getattr(problem.linearizer, "resident", None)
+        if resident is not None and isinstance(act, Covariant):
+            problem = resident(problem)
         jumps = homogeneous and problem.refinement is not None and gauge is None
         minimize = far.minimize if jumps else lm.minimize
         begun, unit = Estimate(cameras, points), job.scale_px**2
         outcome = minimize(problem, begun, act, schedule(), stopping, callback, unit)
+        outcome = problem.fetched(outcome)
         if homogeneous and home and outcome.system is None and np.isfinite(outcome.state.cost):
             outcome = replace(outcome, system=problem.linearize(outcome.state))
         found = outcome.state.cameras, outcome.state.points

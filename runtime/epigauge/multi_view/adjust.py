@@ -336,7 +336,9 @@ def bundle_adjust(
     if damping is not None:
         as_choice("damping", damping, DAMPINGS)
     gauge = checked_gauge(gauge, method)
-    workers = as_count("workers", workers)
+    threads = 1
+    if not hasattr(workers, "linearizer"):  # what epigauge.distributed passes
+        workers = threads = as_count("workers", workers)
     stopping = lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter)
     table = kernels.table(backend)
     start = initialize(tracks, backend=backend) if start is None else start
@@ -386,7 +388,7 @@ def bundle_adjust(
         verdict = judged_metric(tracks, reconstruction, depths, outcome, table, *free)
     else:
         linear = loss == "linear"
-        how = linear, table, workers, stays if job.fixes_gauge else None
+        how = linear, table, threads, stays if job.fixes_gauge else None
         verdict = judged(tracks, reconstruction, rejected, *how, outcome.system if linear else None)
         predicted = reconstruction.project(tracks)
     unit, residuals = job.scale_px**2, tracks.xy - predicted

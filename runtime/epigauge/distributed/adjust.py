@@ -1,0 +1,162 @@
+"""Bundle adjustment by the workers of a Dask cluster."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge._arguments import as_choice, as_count
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.ties import Ties
+from epigauge.cameras import AnyReconstruction, CameraModel
+from epigauge.distributed.dispatch import Dispatch
+from epigauge.distributed.linearizer import DistributedLinearizer, Piece
+from epigauge.distributed.partition import Observations
+from epigauge.errors import ArgumentError
+from epigauge.kernels import Table
+from epigauge.multi_view.adjust import BundleResult
+from epigauge.multi_view.adjust import bundle_adjust as adjust_here
+from epigauge.multi_view.tracks import Tracks
+from epigauge.two_view.losses import Loss
+
+__all__ = ["bundle_adjust"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: Observations of a partition, about, and least number of partitions where points suffice.
+_SIZE, _LEAST = 250_000, 8
+
+
+class Workers:
+    """Where observations are evaluated: what `epigauge.bundle.backends.Elsewhere` says."""
+
+    def __init__(self, client: Any, partitions: int | None, solver: str) -> None:
+        self._dispatch, self._solver, self._partitions = Dispatch(client), solver, partitions
+
+    def linearizer(
+        self,
+        model: CameraModel,
+        kernels: Table,
+        graph: ObservationGraph,
+        q: Array,
+        weights: Array,
+        loss: Loss,
+        ties: Ties | None,
+        whitening: Array | None,
+    ) -> DistributedLinearizer:
+        """Return the evaluation of observations by the workers."""
+        return DistributedLinearizer(
+            self._dispatch,
+            cut(graph, q, weights, whitening, self._partitions),
+            (graph.n_views, graph.n_points, len(graph.point)),
+            model,
+            kernels,
+            loss,
+            None if ties is None else ties.used,
+            float(weights.max()),
+            self._solver,
+            graph,
+        )
+
+    def close(self) -> None:
+        """Let the workers forget everything."""
+        self._dispatch.sweep()
+
+
+def cut(
+    graph: ObservationGraph, q: Array, weights: Array, whitening: Array | None, count: int | None
+) -> list[Piece]:
+    """Cut observations into partitions of about equal size, neighbouring points together.
+
+    How many depends on the observations alone: so do the sums, to the last bit.
+    """
+    N, m = len(graph.point), graph.n_points
+    wanted = count if count is not None else max(_LEAST, -(-N // _SIZE))
+    first, view = graph.first, graph.view
+    order = np.lexsort((view[first[1:] - 1], view[first[:-1]]))
+    sizes = np.diff(first)[order]
+    ends = np.searchsorted(np.cumsum(sizes), N * np.arange(1, wanted + 1) / wanted - 0.5) + 1
+    ends = np.unique(np.minimum(ends, m))
+    pieces = []
+    for begin, end in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True):
+        points, counts = order[begin:end], sizes[begin:end]
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        own = np.repeat(np.arange(end - begin), counts)
+        rows = first[points][own] + np.arange(starts[-1]) - starts[own]
+        white = None if whitening is None else np.ascontiguousarray(whitening[..., rows])
+        parts = view[rows], own, np.ascontiguousarray(q[:, rows]), weights[rows], white
+        pieces.append(Piece(points, Observations(*parts), rows))
+    return pieces
+
+
+def bundle_adjust(
+    source: Tracks,
+    client: Any,
+    start: AnyReconstruction | None = None,
+    *,
+    partitions: int | None = None,
+    solver: str = "auto",
+    **options: Any,
+) -> BundleResult:
+    """Minimise the reprojection error of cameras and points by the workers of a Dask cluster.
+
+    Points are partitioned. Each worker builds its partitions once and keeps their points from step
+    to step; what travels are cameras, costs, gradients and the partitions' blocks of the cameras'
+    reduced system. They are summed in a fixed tree over partitions, of which the observations
+    decide how many there are: the result is the same, to the last bit, for any number of workers.
+
+    Parameters
+    ----------
+    source : Tracks
+        Observations.
+    client : distributed.Client
+        Connected to a scheduler with workers that have the same epigauge installed, and that can be
+        reached from here.
+    start : Reconstruction, MetricReconstruction or AffineReconstruction, optional
+        As in `epigauge.bundle_adjust`.
+    partitions : int, optional
+        How many partitions; by default one for each 250,000 observations, but at least 8. Another
+        number gives a result that differs by rounding.
+    solver : {"auto", "factor", "cg"}
+        How the reduced system is solved: by a factor, computed here, or by conjugate gradients,
+        whose products the workers compute. By default the first, unless it fills too much.
+    **options
+        All those of `epigauge.bundle_adjust` but `workers`.
+
+    Returns
+    -------
+    BundleResult
+        As of `epigauge.bundle_adjust`, which it equals but for rounding.
+
+    Raises
+    ------
+    ArgumentError
+        If the client is none, has lost its scheduler or has no workers, if one partition loses
+        worker after worker, and as of `epigauge.bundle_adjust`.
+
+    Notes
+    -----
+    A worker that dies costs a step: its partitions are rebuilt elsewhere from the points of the
+    last accepted step, with the same result. With method "covariant" and without priors points stay
+    at the workers; otherwise they travel with each step, which costs time alone.
+
+    Examples
+    --------
+    >>> from distributed import Client  # doctest: +SKIP
+    >>> client = Client(n_workers=4, threads_per_worker=1)  # doctest: +SKIP
+    >>> result = eg.distributed.bundle_adjust(tracks, client, scene)  # doctest: +SKIP
+    """
+    as_choice("solver", solver, ("auto", "factor", "cg"))
+    if partitions is not None:
+        partitions = as_count("partitions", partitions)
+    if "workers" in options:
+        raise ArgumentError("workers", "is given beside a client", "the client alone")
+    workers = Workers(client, partitions, solver)
+    try:
+        there: Any = workers
+        return adjust_here(source, start, workers=there, **options)
+    finally:
+        workers.close()
