@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from epigauge.errors import ArgumentError, FileFormatError, MissingPackageError
 from epigauge.images import DETECTORS
+from epigauge.images.loading import thumbnail
 from photographs import rendered
 from two_views import same_geometry
 
@@ -355,3 +356,15 @@ def test_without_opencv_the_remedy_is_named(monkeypatch, small) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(MissingPackageError, match=r"pip install 'epigauge\[cv\]'"):
         eg.match_images(*small)
+
+
+@pytest.mark.parametrize("shape", [(300, 500, 3), (500, 300), (40, 50, 3)])
+def test_thumbnails_show_the_same_smaller(tmp_path, shape) -> None:
+    image = np.full(shape, 40, dtype=np.uint8)
+    image[: shape[0] // 2, ..., : (1 if len(shape) == 3 else None)] = 200  # red, or light, above
+    cv2.imwrite(str(tmp_path / "a.png"), image[..., ::-1] if len(shape) == 3 else image)
+    (tmp_path / "small.jpg").write_bytes(thumbnail(tmp_path / "a.png", 100))
+    small = eg.load_image(tmp_path / "small.jpg")
+    assert max(small.shape[:2]) == min(100, max(shape[:2]))
+    assert small.shape[0] / small.shape[1] == pytest.approx(shape[0] / shape[1], abs=0.02)
+    assert abs(int(np.atleast_1d(small[5, 5])[0]) - int(np.atleast_1d(image[0, 0])[0])) < 60

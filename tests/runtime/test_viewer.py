@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import json
 import re
@@ -168,3 +169,10 @@ def test_ellipsoids_are_those_of_the_covariance_where_it_is_shown(tmp_path) -> N
     assert abs(np.array([np.cos(angle), np.sin(angle)]) @ axes[:, 1]) == pytest.approx(1.0)
     known = np.linalg.eigvalsh([[3.0, 1.0, 0.5], [1.0, 2.0, 0.2], [0.5, 0.2, 1.0]])
     np.testing.assert_allclose(said["extremes"], known[[2, 0]])
+
+
+def test_pictures_are_in_the_page(tmp_path) -> None:
+    pictures = [bytes([255, 216, k]) for k in range(SCENE.tracks.n_views)]
+    found = data_of(saved(tmp_path, pictures=pictures))["pictures"]
+    assert [base64.b64decode(picture) for picture in found] == pictures
+    assert data_of(saved(tmp_path))["pictures"] == []

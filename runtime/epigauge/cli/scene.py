@@ -21,6 +21,8 @@ from epigauge.cli._common import DONE, NOT_CONVERGED, console, facts, shown
 from epigauge.cli._scenes import save_cloud
 from epigauge.cli.metric import camera_rows
 from epigauge.errors import ArgumentError, FileFormatError
+from epigauge.images.loading import thumbnail
+from epigauge.images.pairwise import names_of
 from epigauge.images.tracks import NoTracks, TrackSource, build_tracks
 from epigauge.io import plain, save_scene
 from epigauge.io._npz_scene import write_npz_scene
@@ -85,7 +87,8 @@ def scene(
         out.print(f"[bold red]no scene:[/] the photographs {escape(error.was)}", soft_wrap=True)
         out.print(f"needed: {escape(error.needed)}", soft_wrap=True)
         return NOT_CONVERGED
-    answer = _Answer(tracks, result, time.perf_counter() - begin)
+    photographs = dict(zip(names_of(found), found, strict=True)) if isinstance(found, list) else {}
+    answer = _Answer(tracks, result, photographs, time.perf_counter() - begin)
     answer.report(out)
     if not result.success:
         return NOT_CONVERGED
@@ -154,8 +157,16 @@ def _upgraded(tracks: eg.Tracks, cameras: str, camera: str) -> eg.MetricUpgrade:
 class _Answer:
     """A scene from photographs and the forms it is given in."""
 
-    def __init__(self, tracks: eg.Tracks, result: eg.MetricUpgrade, seconds: float) -> None:
+    def __init__(
+        self,
+        tracks: eg.Tracks,
+        result: eg.MetricUpgrade,
+        photographs: dict[str, Path],
+        seconds: float,
+    ) -> None:
         self.tracks, self.result, self.seconds = tracks, result, seconds
+        #: Files by the names of the views; none of a database.
+        self.photographs = photographs
         source = tracks.source
         assert isinstance(source, TrackSource)
         self.source = source
@@ -221,9 +232,9 @@ class _Answer:
         assert bundle is not None  # of a success
         shown_result = replace(bundle, reconstruction=found, fun=tracks.xy - found.project(tracks))
         frame = display(found, tracks, y_up=False)
-        save_viewer(
-            folder / "index.html", shown_result, tracks, "Scene", frame=frame, notes=self.notes()
-        )
+        pictures = [thumbnail(self.photographs[n]) for n in tracks.names or () if self.photographs]
+        extra: dict[str, Any] = {"frame": frame, "notes": self.notes(), "pictures": pictures}
+        save_viewer(folder / "index.html", shown_result, tracks, "Scene", **extra)
 
     def _document(self) -> dict[str, Any]:
         """Return everything as plain data."""

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from epigauge.errors import ArgumentError, FileFormatError, MissingPackageError
 from epigauge.io._common import PathLike, cut
 
-__all__ = ["Image", "as_image", "load_image", "opencv"]
+__all__ = ["Image", "as_image", "load_image", "opencv", "thumbnail"]
 
 Image = NDArray[np.uint8]
 
@@ -90,6 +90,36 @@ def load_image(path: PathLike) -> Image:
     if image is None:
         raise FileFormatError(path, "is damaged, or no image that OpenCV reads")
     return np.ascontiguousarray(_to_8_bits(image if image.ndim == 2 else image[:, :, ::-1]))
+
+
+def thumbnail(path: PathLike, size: int = 192) -> bytes:
+    """Return a photograph as a small JPEG file.
+
+    Parameters
+    ----------
+    path : str or path
+        The photograph.
+    size : int
+        The longer side in pixels, at most.
+
+    Returns
+    -------
+    bytes
+        The file.
+
+    Raises
+    ------
+    FileFormatError, OSError, MissingPackageError
+        As `load_image`.
+    """
+    cv2, image = opencv(), load_image(path)
+    height, width = image.shape[:2]
+    scale = min(1.0, size / max(height, width))
+    to = max(1, round(width * scale)), max(1, round(height * scale))
+    small = cv2.resize(image, to, interpolation=cv2.INTER_AREA)
+    # Given as OpenCV wants it: blue, green, red.
+    coded = np.ascontiguousarray(small[:, :, ::-1] if small.ndim == 3 else small)
+    return bytes(cv2.imencode(".jpg", coded, [cv2.IMWRITE_JPEG_QUALITY, 80])[1])
 
 
 def as_image(name: str, image: PathLike | ArrayLike) -> Image:

@@ -19,7 +19,7 @@ from epigauge.images.matching import features, seeker
 from epigauge.io._common import PathLike
 from epigauge.io.output import writing
 
-__all__ = ["PairwiseMatches", "match_photographs"]
+__all__ = ["PairwiseMatches", "match_photographs", "names_of"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -208,7 +208,7 @@ def match_photographs(
             progress("pairs", k, len(listed))
         matched[i, j] = _matched(found[i][2], found[j][2], ratio)
     return PairwiseMatches(
-        _names(paths),
+        names_of(paths),
         np.array([size for size, *_ in found]),
         tuple(x for _, x, _, _ in found),
         matched,
@@ -216,7 +216,7 @@ def match_photographs(
     )
 
 
-def _names(paths: list[Path]) -> tuple[str, ...]:
+def names_of(paths: list[Path]) -> tuple[str, ...]:
     """Return names without the part that all paths have in common."""
     if len({path.name for path in paths}) == len(paths):
         return tuple(path.name for path in paths)

@@ -48,8 +48,8 @@ class Display:
     centres : ndarray, shape (n, 3)
         Centres of the cameras; those farther than `FAR_CAMERA` are put there, in their direction.
     corners : ndarray, shape (n, 4, 3)
-        For each camera the directions in which it sees the corners of what the views show, in the
-        order left top, right top, right bottom, left bottom.
+        For each camera the directions in which it sees the corners of its image, or where its size
+        is not known of what the views show: left top, right top, right bottom, left bottom.
     ahead : ndarray of bool, shape (m,)
         Finite points in front of all cameras that see them.
     shown : ndarray of bool, shape (m,)
@@ -115,6 +115,9 @@ def display(reconstruction: AnyReconstruction, tracks: Tracks, *, y_up: bool = F
     to_pixels[:2, 2] = (low + high) / 2.0
     half = (high - low) / 2.0 / unit
     box = half * [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+    if tracks.sizes is not None and not y_up:  # all that the images show
+        sides = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * np.asarray(tracks.sizes)[:, None, :]
+        box = (sides - 0.5 - (low + high) / 2.0) / unit
     if isinstance(reconstruction, MetricReconstruction):
         seen = reconstruction.to_projective()
         P, behind = np.linalg.solve(to_pixels, seen.P), ~(reconstruction.depths(tracks) > 0.0)
@@ -201,9 +204,10 @@ def _upright(P: Array, Q: Array) -> Array:
 
 
 def _pyramids(P: Array, box: Array) -> tuple[Array, Array]:
-    """Return centres, and directions to the corners of a box in the image."""
+    """Return centres, and directions to the corners of a box in the images, or one in each."""
     M = P[:, :, :3] * np.sign(np.linalg.det(P[:, :, :3]))[:, None, None]
     centres = -(np.linalg.inv(P[:, :, :3]) @ P[:, :, 3:])[:, :, 0]
-    corners = np.column_stack([box, np.ones(len(box))])
-    directions = np.einsum("nij,cj->nci", np.linalg.inv(M), corners)
+    box = np.broadcast_to(box, (len(P), 4, 2))
+    corners = np.concatenate([box, np.ones((len(P), 4, 1))], axis=2)
+    directions = np.einsum("nij,ncj->nci", np.linalg.inv(M), corners)
     return centres, directions / np.linalg.norm(directions, axis=2, keepdims=True)

@@ -114,6 +114,12 @@ function start() {
   }
   const canvas = by("scene"), tip = by("tip"), pen = canvas.getContext("2d");
   const colours = palette(), count = data.rms.length;
+  const pictures = data.pictures.map((picture) => {
+    const image = new Image();
+    image.addEventListener("load", draw);
+    image.setAttribute("src", "data:image/jpeg;base64," + picture);
+    return image;
+  });
   const xs = new Float32Array(count), ys = new Float32Array(count), zs = new Float32Array(count);
   const home = { yaw: (-28 * Math.PI) / 180, pitch: (24 * Math.PI) / 180 };
   const view = { ...home, centre: [...data.middle], distance: 1 };
@@ -205,6 +211,7 @@ function start() {
     if (by("path").checked) strokes(PATH, 1.2, () => {
       for (let k = 1; k < data.cameras.length; k++) line(project, data.cameras[k - 1].centre, data.cameras[k].centre);
     });
+    if (by("cameras").checked && by("pictures").checked) paintPictures(project);
     if (by("cameras").checked) strokes(CAMERA, 1.2, () => { for (const camera of data.cameras) pyramid(project, camera); });
     if (data.spread && by("ellipsoids").checked) paintEllipsoids(project);
     paintMarked(project);
@@ -277,6 +284,21 @@ function start() {
     });
   }
 
+  // Photographs in the bases of the pyramids, the farthest first: nearly parallelograms there.
+  function paintPictures(project) {
+    const bases = pictures.map((image, k) => ({ image, at: rim(data.cameras[k]).map(project) }))
+      .filter(({ image, at }) => image.complete && image.naturalWidth && at.every((p) => p[2] > NEAR));
+    bases.sort((a, b) => b.at[0][2] + b.at[2][2] - a.at[0][2] - a.at[2][2]);
+    for (const { image, at: [p, q, , r] } of bases) {
+      pen.save();
+      const w = image.naturalWidth, h = image.naturalHeight;
+      pen.transform((q[0] - p[0]) / w, (q[1] - p[1]) / w, (r[0] - p[0]) / h, (r[1] - p[1]) / h, p[0], p[1]);
+      pen.globalAlpha = 0.85;
+      pen.drawImage(image, 0, 0);
+      pen.restore();
+    }
+  }
+
   function paintMarked(project) {
     if (!marked) return;
     if (marked.point === undefined) {
@@ -338,6 +360,7 @@ function start() {
       const head = document.createElement("b");
       head.textContent = title;
       tip.replaceChildren(head, "\n" + rest.join("\n"));
+      if (marked.point === undefined && pictures.length) tip.append(pictures[marked.camera]);
       const room = 16, wide = tip.offsetWidth, tall = tip.offsetHeight;
       tip.style.left = clamp(x + room, 0, Math.max(width - wide, 0)) + "px";
       tip.style.top = (y + room + tall > height ? Math.max(y - room - tall, 0) : y + room) + "px";
@@ -434,7 +457,7 @@ function start() {
     draw();
   });
 
-  for (const id of ["cameras", "path", "grid", "ellipsoids"]) by(id).addEventListener("change", draw);
+  for (const id of ["cameras", "pictures", "path", "grid", "ellipsoids"]) by(id).addEventListener("change", draw);
   for (const id of ["size", "scale", "magnify"]) by(id).addEventListener("input", draw);
   by("colour").addEventListener("change", colour);
   by("reset").addEventListener("click", () => turn(home.yaw, home.pitch));
@@ -443,6 +466,7 @@ function start() {
   by("side").addEventListener("click", () => turn(-Math.PI / 2, 0));
 
   by("path").checked = data.sequence;
+  by("photos").style.display = pictures.length ? "" : "none";
   by("sure").style.display = data.spread ? "" : "none";
   const resize = () => {
     const ratio = window.devicePixelRatio || 1;

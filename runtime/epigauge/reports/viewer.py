@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import html
 from collections.abc import Sequence
 from typing import Any
@@ -40,6 +41,7 @@ def save_viewer(
     point_numbers: ArrayLike | None = None,
     notes: Sequence[str] = (),
     covariance: MetricCovariance | None = None,
+    pictures: Sequence[bytes] = (),
 ) -> None:
     """Write points and cameras as a page to look at them from all sides.
 
@@ -66,6 +68,9 @@ def save_viewer(
         Sentences to show below the title.
     covariance : MetricCovariance, optional
         Of a calibrated reconstruction: error ellipsoids of points and cameras are drawn, magnified.
+    pictures : sequence of bytes
+        JPEG file of each view, small ones, to be shown where the camera is; the whole image, and
+        tracks that know the sizes of theirs.
 
     Raises
     ------
@@ -105,6 +110,7 @@ def save_viewer(
     }
     data = _data(shown, tracks, result.fun, views, points)
     kept = np.asarray(data.pop("kept"))
+    data["pictures"] = [base64.b64encode(picture).decode("ascii") for picture in pictures]
     data["spread"] = None if covariance is None else _spread(shown, covariance, kept)
     save_page(path, "viewer", parts, data)
 
