@@ -6,6 +6,7 @@ import bz2
 import gzip
 import io
 from pathlib import Path
+from typing import Any
 
 import epigauge as eg
 import numpy as np
@@ -14,6 +15,8 @@ from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import load_track_file, save_ply
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
+from tests.metric_scenes import metric_scene
 
 SCENE = eg.multi_view_scene(n_views=4, n_points=12, visible=0.7, seed=2)
 TRACKS = SCENE.tracks
@@ -438,3 +441,60 @@ def test_names_of_another_number_are_refused(tmp_path: Path) -> None:
         np.savez(tmp_path / "tracks.npz", names=names, **arrays)
         with pytest.raises(FileFormatError, match="names"):
             eg.load_tracks(tmp_path / "tracks.npz")
+
+
+@pytest.mark.parametrize("form", ["sigma", "sigmas", "covariance"])
+def test_npz_keeps_how_well_coordinates_are_measured(form: str, tmp_path: Path) -> None:
+    """Unit and whitening come back to the last bit, from tracks and from scenes."""
+    rng = np.random.default_rng(2)
+    tracks, scene = metric_scene("SIMPLE_RADIAL", 3, n_points=20)
+    order = rng.permutation(len(tracks))
+    L = rng.normal(0.0, 0.2, (len(tracks), 2, 2)) + np.eye(2)
+    how: dict[str, Any] = {
+        "sigma": {"sigma": rng.uniform(0.2, 3.0, len(tracks))},
+        "sigmas": {"sigma": rng.uniform(0.2, 3.0, (len(tracks), 2))},
+        "covariance": {"covariance": L @ np.swapaxes(L, 1, 2)},
+    }[form]
+    rows = tracks.view[order], tracks.point[order], tracks.xy[order]
+    whole = eg.Tracks(*rows, **how)
+    path = tmp_path / "tracks.npz"
+    eg.save_tracks(path, whole)
+    eg.save_scene(tmp_path / "scene.npz", whole, scene)
+    for found in (
+        eg.load_tracks(path),
+        eg.load_tracks(path, prune="first"),
+        eg.load_scene(tmp_path / "scene.npz")[0],
+    ):
+        assert found.unit == whole.unit
+        np.testing.assert_array_equal(found.weights, whole.weights)
+        assert (found.whitening is None) == (whole.whitening is None)
+        if whole.whitening is not None:
+            np.testing.assert_array_equal(found.whitening, whole.whitening)
+    some = eg.load_tracks(path, views=[0, 1, 3], prune="first")
+    kept = np.isin(whole.view, [0, 1, 3]) & (
+        np.bincount(whole.point[np.isin(whole.view, [0, 1, 3])], minlength=20)[whole.point] > 1
+    )
+    if whole.whitening is None:
+        assert some.whitening is None
+    else:
+        np.testing.assert_array_equal(some.whitening, whole.whitening[:, :, kept])
+        with pytest.raises(eg.ArgumentError, match="npz"):
+            eg.save_tracks(tmp_path / "tracks.csv", whole)
+
+
+@pytest.mark.parametrize(
+    ("name", "array"),
+    [
+        ("unit", np.array(-1.0)),
+        ("unit", np.array([1.0, 2.0])),
+        ("whitening", np.ones((3, 2, 2))),
+        ("whitening", None),
+    ],
+)
+def test_npz_with_no_such_measurements_is_refused(name: str, array: Any, tmp_path: Path) -> None:
+    tracks, _ = metric_scene("PINHOLE", 3, n_points=10)
+    array = np.full((len(tracks), 2, 2), np.nan) if array is None else array
+    path = tmp_path / "tracks.npz"
+    np.savez(path, view=tracks.view, point=tracks.point, xy=tracks.xy, **{name: array})
+    with pytest.raises(eg.FileFormatError, match=name):
+        eg.load_tracks(path)

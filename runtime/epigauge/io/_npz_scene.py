@@ -18,7 +18,7 @@ from epigauge.io._common import MAX_MATCHES, cut
 from epigauge.io._npz import read_npz, write_npz
 from epigauge.io._scene import ColmapSource, RawScene, SceneSource
 from epigauge.io.output import writing
-from epigauge.io.tracks import arrays_of, check_observations
+from epigauge.io.tracks import MEASURED, arrays_of, check_observations
 from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.tracks import Tracks
 
@@ -28,7 +28,7 @@ _TRACKS = ("view", "point", "xy")
 _NEEDED = (*_TRACKS, "R", "t", "X", "model", "params", "camera_of_view")
 #: The same of cameras without rotations: affine and projective ones.
 _AFFINE, _PROJECTIVE = (*_TRACKS, "P", "X"), (*_TRACKS, "P", "Q")
-_LABELS = ("weights", "names", "sizes", "colours", "notes", "rotations")
+_LABELS = (*MEASURED, "weights", "names", "sizes", "colours", "notes", "rotations")
 _IDS = ("image_ids", "camera_ids", "point_ids", "feature_of")
 _COLMAP = (*(f"colmap_{name}" for name in _IDS), "colmap_features", "colmap_feature_counts")
 _TEXTS = ("colmap_cameras", "colmap_rigs", "colmap_frames")
@@ -183,6 +183,7 @@ def read_npz_scene(path: Path) -> RawScene:
         found.get("sizes"),
         found.get("colours"),
         source,
+        {name: found[name] for name in ("view", *MEASURED) if name in found},
     )
 
 

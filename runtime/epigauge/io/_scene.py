@@ -17,6 +17,7 @@ from epigauge.cameras import (
     MetricReconstruction,
 )
 from epigauge.errors import ArgumentError, FileFormatError
+from epigauge.io.tracks import restore_measurement
 from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.tracks import Tracks
 
@@ -82,7 +83,8 @@ class ColmapSource:
 class RawScene:
     """Arrays of a file: an observation, view, camera or point a row; nothing left out yet.
 
-    Cameras without rotations have P (n, 3, 4) for R, and no t and params.
+    Cameras without rotations have P (n, 3, 4) for R, and no t and params. `measured` holds `view`,
+    and how the measurements differ beside their weights.
     """
 
     view: Indices
@@ -99,6 +101,7 @@ class RawScene:
     sizes: NDArray[Any] | None = None
     colours: NDArray[Any] | None = None
     source: SceneSource = field(default_factory=SceneSource)
+    measured: dict[str, Any] = field(default_factory=dict)
 
 
 def finished(
@@ -161,6 +164,7 @@ def finished(
             repeated=True,
             min_points=MIN_POINTS,
         )
+        restore_measurement(path, raw.measured, tracks, np.flatnonzero(keep)[tracks.order])
         reconstruction: AnyReconstruction
         if raw.model == "affine":
             reconstruction = AffineReconstruction(raw.R[views], raw.X[points])

@@ -36,6 +36,8 @@ _COLUMNS = Columns(
     labels=("view",),
 )
 _TRACKS = ("view", "point", "xy")
+#: How measurements differ beside their weights.
+MEASURED = ("unit", "whitening")
 _SUFFIXES = (".npz", ".csv", ".txt", ".txt.bz2", ".txt.gz")
 
 
@@ -70,7 +72,8 @@ def load_tracks(
     """Read tracks from an NPZ, CSV or BAL file.
 
     NPZ: arrays ``view``, ``point`` (N,) and ``xy`` (N, 2); optionally ``weights`` (N,), ``clean``
-    (one mark a point), ``n_views`` and ``n_points``. CSV: columns view, point, x, y, or a first
+    (one mark a point), ``n_views`` and ``n_points``, and ``unit`` and ``whitening`` as of `Tracks`.
+    CSV: columns view, point, x, y, or a first
     line with the names of the columns: these in any order, optionally ``weight`` and ``clean``
     (one mark an observation). Views may have names, such as those of files, in place of numbers,
     and are then sorted by them; numbers may begin anywhere and have gaps: both are kept in
@@ -175,6 +178,9 @@ def load_track_file(
             )
     except ArgumentError as error:
         raise FileFormatError(path, str(error)) from None
+    if "unit" in found or "whitening" in found:
+        same = _rows(tracks, old_views, old_points, (view, point, xy))
+        restore_measurement(path, found, tracks, same)
     tracks.names = _names(path, found, old_views, tracks.names)
     if "sizes" in found:
         tracks.sizes, tracks.colours = found["sizes"][old_views], found["colours"][old_points]
@@ -325,14 +331,68 @@ def save_reconstruction(path: PathLike, reconstruction: Reconstruction) -> None:
 def arrays_of(tracks: Tracks) -> dict[str, Any]:
     """Return the arrays that stand for tracks in NPZ.
 
-    Weights only where they are not all one, names of views where there are any.
+    Weights only where they are not all one, names of views where there are any; unit and whitening,
+    (N, 2, 2), only where the measurements had a `sigma` or a `covariance`.
     """
     found: dict[str, Any] = {"view": tracks.view, "point": tracks.point, "xy": tracks.xy}
     if (tracks.weights != 1.0).any():
         found["weights"] = tracks.weights
     if tracks.names is not None:
         found["names"] = np.array(tracks.names)
+    if tracks.unit != 1.0:
+        found["unit"] = np.array(tracks.unit)
+    if tracks.whitening is not None:
+        found["whitening"] = tracks.whitening.transpose(2, 0, 1)
     return found
+
+
+def restore_measurement(
+    path: Path, found: dict[str, Any], tracks: Tracks, rows: Indices | None = None
+) -> None:
+    """Give tracks the unit and the whitening of a file, where it has them.
+
+    Parameters
+    ----------
+    path : Path
+        The file for messages.
+    found : dict
+        Its arrays.
+    tracks : Tracks
+        Read from it.
+    rows : ndarray of int, shape (N,), optional
+        The row in the file of each observation of the tracks; by default those of `order`.
+
+    Raises
+    ------
+    FileFormatError
+        If the arrays are none that `arrays_of` makes.
+    """
+    unit, whitening = found.get("unit"), found.get("whitening")
+    if unit is not None:
+        if unit.shape != () or unit.dtype.kind != "f" or not 0.0 < unit < np.inf:
+            raise FileFormatError(path, "unit is no positive number")
+        tracks.unit = float(unit)
+    if whitening is None:
+        return
+    if whitening.shape != (len(found["view"]), 2, 2) or whitening.dtype.kind != "f":
+        was = f"whitening has type {whitening.dtype}, shape {whitening.shape}"
+        raise FileFormatError(path, f"{was}; needed: floats ({len(found['view'])}, 2, 2)")
+    with np.errstate(all="ignore"):
+        bad = np.flatnonzero(~(np.abs(np.linalg.det(whitening) - 1.0) < 1e-6))
+    if len(bad):
+        raise FileFormatError(path, f"whitening has no determinant of one in row {bad[0]}")
+    rows = tracks.order if rows is None else rows
+    tracks.whitening = np.ascontiguousarray(whitening[rows].transpose(1, 2, 0))
+
+
+def _rows(
+    tracks: Tracks, views: Indices, points: Indices, found: tuple[Indices, Indices, Array]
+) -> Indices:
+    """Return the row in the file of each observation, by view, point and place."""
+    mine = np.column_stack([views[tracks.view], points[tracks.point], tracks.xy])
+    both = np.vstack([np.column_stack(found), mine])
+    first, inverse = np.unique(both, axis=0, return_index=True, return_inverse=True)[1:]
+    return np.asarray(first[inverse.ravel()[len(both) - len(mine) :]])
 
 
 def _form(path: PathLike) -> str:
@@ -362,7 +422,7 @@ def _read(path: Path, with_start: bool, image_size: ArrayLike | None = None) -> 
             raise ArgumentError("image_size", f"is given for {path.name!r:.60}", "OpenSfM's tracks")
         if form == ".npz":
             start = ("P", "Q", "X") if with_start else ()
-            optional = ("weights", "clean", "n_views", "n_points", *start)
+            optional = (*MEASURED, "weights", "clean", "n_views", "n_points", *start)
             return dict(
                 read_npz(path, file, [_TRACKS, ("P", "Q"), ("P", "X")], optional, ["names"])
             )
@@ -457,6 +517,9 @@ def _count(path: Path, name: str, found: dict[str, Any]) -> int | None:
 
 
 def _write_csv(file: IO[bytes], tracks: Tracks) -> None:
+    if tracks.whitening is not None:
+        was = "have coordinates measured unlike, or together, for which CSV has no place"
+        raise ArgumentError("tracks", was, "a name ending in .npz")
     arrays = arrays_of(tracks)
     names = None if tracks.names is None else np.array(list(map(_label, tracks.names)))
     views = tracks.view if names is None else names[tracks.view]
