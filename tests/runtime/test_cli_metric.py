@@ -32,6 +32,7 @@ def test_a_scene_is_written_in_every_form(run, tmp_path: Path) -> None:
     assert abs(value - 900.0) < 4.0 * std
     assert "+-" in err
     assert "nothing can be measured" not in page.read_text()
+    assert "Ellipsoids of one sigma" in page.read_text()
     for target in outputs[:2]:
         tracks, scene = eg.load_scene(target)
         assert scene.cameras.params[0, 0] == pytest.approx(value, rel=1e-12)

@@ -65,6 +65,7 @@ def test_page_needs_nothing_else_and_says_what_it_is(tmp_path) -> None:
     assert not re.search(r"(src|href)\s*=|https?://|@import|fetch\(|XMLHttpRequest", page)
     assert "default-src 'none'" in page
     assert "no calibration" in page
+    assert "No ellipsoids are drawn" in page
     assert page.count("</script>") == 2
     assert "<h1>&lt;/script&gt;&lt;b&gt;&amp;</h1>" in page
     assert 'class="warning"' not in page

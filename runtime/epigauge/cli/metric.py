@@ -177,7 +177,9 @@ class _Answer:
         bundle = self.result.bundle
         assert bundle is not None  # of a success
         frame = display(bundle.reconstruction, self.tracks, y_up=False)
-        save_viewer(path, bundle, self.tracks, named(self.source), frame=frame)
+        sure = self.result.covariance
+        title = named(self.source)
+        save_viewer(path, bundle, self.tracks, title, frame=frame, covariance=sure)
 
     def report(self, out: Console) -> None:
         """Tell people on stderr what came out."""

@@ -96,7 +96,11 @@ def save_viewer(
     if isinstance(result.reconstruction, MetricReconstruction):
         lead += ". Calibrated cameras: the shape is true, its size is not known."
     else:
-        lead += ". A basis to look at, no calibration: nothing can be measured in it."
+        lead += (
+            ". A basis to look at, no calibration: nothing can be measured in it. No ellipsoids "
+            "are drawn, for their axes would be those of the basis. `epigauge metric` finds "
+            "a metric frame, where the views allow one."
+        )
     if covariance is not None:
         lead += f" Ellipsoids of one sigma, noise {covariance.noise_px:.3g} px, magnified."
     hidden = tracks.n_points - int(shown.shown.sum())
