@@ -16,6 +16,7 @@ SCRIPTS = {
     "evaluations.py": ["--trials", "5"],
     "bias.py": ["--trials", "50"],
     "robust.py": ["--trials", "3"],
+    "databases.py": ["--images", "4", "--runs", "1"],
     "two_views.py": ["--quick"],
     "kernels.py": ["--quick"],
     "many_views.py": ["--quick"],

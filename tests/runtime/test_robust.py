@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from epigauge import kernels
 from epigauge.errors import MissingPackageError
+from epigauge.two_view import diagnostics
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.consensus import Consensus
 from epigauge.two_view.planes import _is_accidental, chance_pairs
@@ -316,6 +317,25 @@ def test_threshold_that_leaves_fewer_than_eight_inliers_leaves_nothing_in_common
 
 
 @front_end
+@pytest.mark.parametrize(("depth", "plain"), [(0.5, True), (0.0, False)])
+def test_plain_relief_is_told_without_a_fit_and_a_plane_is_not(depth, plain, monkeypatch):
+    rng = np.random.default_rng(5)
+    rays = np.column_stack([*rng.uniform(-0.5, 0.5, (2, 300)), np.ones(300)])
+    X = rays * (6.0 / (rays @ [0.2, -0.1, 1.0]) * (1.0 + depth * rng.uniform(-1, 1, 300)))[:, None]
+    x1, x2 = (
+        1000.0 * Y[:, :2] / Y[:, 2:] + rng.normal(0.0, 0.4, (300, 2))
+        for Y in (X, X + np.array([1.0, 0.2, 0.3]))
+    )
+    x2[::3] = rng.uniform(-500.0, 500.0, x2[::3].shape)
+    fits = []
+    judge = diagnostics.judge_plane
+    monkeypatch.setattr(
+        diagnostics, "judge_plane", lambda *a, **k: fits.append(a) or judge(*a, **k)
+    )
+    flags = eg.estimate_fundamental(x1, x2).flags
+    assert ("planar scene" in flags, not fits) == (not plain, plain)
+
+
 class TestPlanesWithWrongMatches:
     """A few wrong matches always fit an F through a homography; they must not hide the plane."""
 

@@ -21,6 +21,7 @@ from epigauge.two_view.planes import (
     RELIEF,
     affine_cost,
     displacement,
+    is_plain_relief,
     judge_plane,
     may_be_rotation,
     share_on_a_plane,
@@ -169,7 +170,8 @@ def _plane(found: Evidence) -> dict[str, bool]:
     noise2 = max(found.noise, ROUNDING) ** 2
     hidden = found.noise > HIDDEN * RANGE
     everywhere = np.ones(len(found.weights), np.bool_)
-    if not (hidden or found.searched) and share_on_a_plane(found) < MOST_ON:
+    off = is_plain_relief if found.searched else lambda own: share_on_a_plane(own) < MOST_ON
+    if not hidden and off(found):
         return {"near-affine": _is_affine(found, everywhere)}
     model = judge_plane(found, hidden=hidden)
     on, weights = model.on, found.weights[model.on]

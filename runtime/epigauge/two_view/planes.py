@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.two_view.chance import chance_agreement
 from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.evidence import ROUNDING, WITHIN, Evidence
 from epigauge.two_view.homography import fit_homography, robust_homography
@@ -29,6 +30,7 @@ __all__ = [
     "affine_cost",
     "chance_pairs",
     "displacement",
+    "is_plain_relief",
     "judge_plane",
     "may_be_rotation",
     "rotation_within",
@@ -78,6 +80,10 @@ _SLIGHTLY = 5.0
 _FEW_SLIGHT = 0.1
 
 
+#: So many places off any plane are plainly relief, if they are so many times what chance explains.
+_PLENTY, _PLAINLY = 40, 8.0
+
+
 @dataclass(frozen=True, kw_only=True)
 class Planes:
     """What homographies leave of some matches, in conditioned coordinates.
@@ -112,6 +118,26 @@ class Planes:
 
 def share_on_a_plane(found: Evidence) -> float:
     """Return which share of the inliers the best of some planes through three of them explains."""
+    return float(np.mean(on_a_plane(found)[1]))
+
+
+def is_plain_relief(found: Evidence) -> bool:
+    """Tell by a cheap test that many inliers are off any plane, and no wrong ones by chance.
+
+    Matches side by side count once. False says nothing.
+    """
+    rows, on = on_a_plane(found)
+    q = np.concatenate([found.q1, found.q2])[:, rows[~on]]
+    places = len(np.unique(np.round(q / (_BESIDE * RANGE)), axis=1).T)
+    if places < _PLENTY or np.mean(on) >= MOST_ON:
+        return False
+    limit, share = found.limit, len(rows) / found.q1.shape[1]
+    chance = chance_agreement(found.table, found.F, found.all1, found.all2, limit)
+    return bool(places > _PLAINLY * share * chance * found.rejected)
+
+
+def on_a_plane(found: Evidence) -> tuple[NDArray[np.intp], Mask]:
+    """Return some inliers, and which of them are on the plane of `share_on_a_plane`."""
     U = np.linalg.svd(found.F)[0]
     n = found.q1.shape[1]
     step = -(-n // POOL)
@@ -134,7 +160,8 @@ def share_on_a_plane(found: Evidence) -> float:
             A, b = rows @ rows.T, rows @ (gain * kappa)[on]
             if np.linalg.cond(A) < 1e12:
                 best = np.linalg.solve(A, b)[:, None]
-        return float(np.mean(_on(best, q, kappa, gain, FAR_OFF * found.noise)))
+        on = _on(best, q, kappa, gain, FAR_OFF * found.noise)[0]
+    return np.arange(0, n, step), on
 
 
 def _on(v: Array, q: Array, kappa: Array, gain: Array, bound: float) -> Mask:
