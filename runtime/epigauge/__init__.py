@@ -71,6 +71,7 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge.two_view.homography_result import HomographyResult
     from epigauge.two_view.homography_search import estimate_homography
     from epigauge.two_view.initial import fundamental_7point, fundamental_8point
+    from epigauge.two_view.model import TwoViewResult, estimate_two_view
     from epigauge.two_view.refine import refine_fundamental
     from epigauge.two_view.result import FundamentalResult
     from epigauge.two_view.robust import RobustResult, estimate_fundamental
@@ -112,6 +113,7 @@ __all__ = [
     "RobustResult",
     "RotationPrior",
     "Tracks",
+    "TwoViewResult",
     "TwoViewScene",
     "arrays",
     "backend",
@@ -128,6 +130,7 @@ __all__ = [
     "estimate_fundamental",
     "estimate_fundamental_batch",
     "estimate_homography",
+    "estimate_two_view",
     "focal_lengths",
     "fundamental_7point",
     "fundamental_8point",
@@ -193,6 +196,7 @@ _WHERE = {
     "two_view.homography_result": "HomographyResult",
     "two_view.homography_search": "estimate_homography",
     "two_view.initial": "fundamental_7point fundamental_8point",
+    "two_view.model": "TwoViewResult estimate_two_view",
     "two_view.refine": "refine_fundamental",
     "two_view.result": "FundamentalResult",
     "two_view.robust": "RobustResult estimate_fundamental",

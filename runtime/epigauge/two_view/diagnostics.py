@@ -160,9 +160,13 @@ def planar_bound(n: int, parameters: int) -> float:
     return (2 * n - 8) * ratio
 
 
-def still_bound(n: int) -> float:
-    """Return by how much, in units of the noise squared, no motion may fit worse than H does."""
-    return max(_CHI2_8, 2 * n * _STILL)
+def still_bound(n: int, redundancy: int | None = None) -> float:
+    """Return by how much, in units of the noise squared, no motion may fit worse than H does.
+
+    With a redundancy the noise is that of H itself: the bound is the quantile of Fisher's F then.
+    """
+    known = _CHI2_8 if redundancy is None else 8.0 * _variance_ratio_99(8, max(redundancy, 4))
+    return max(known, 2 * n * _STILL)
 
 
 def _plane(found: Evidence) -> dict[str, bool]:

@@ -326,7 +326,7 @@ def _flags(
         told["gross errors"] = bool(np.sum(squared[squared > tail]) > TAIL_SHARE * np.sum(squared))
     moved = q2 - q1 - (to2[:2, 2] - to1[:2, 2])[:, None]
     more = float(weights @ np.sum(moved**2, axis=0)) / 2.0 - float(np.sum(squared))
-    told["still camera"] = more <= still_bound(n) * noise2
+    told["still camera"] = more <= still_bound(n, 2 * n - PARAMETERS) * noise2
     if not told["still camera"]:
         B = across(state.H)
         told["pure rotation"] = rotation_within(to1, to2, noise, state.H, B @ N @ B.T)

@@ -1,0 +1,305 @@
+"""Which model of two views some matches support: nothing, no motion, a rotation, a plane, F or E.
+
+All models are fitted, and each is given the likelihood of all matches with its degrees of freedom.
+Whether one of them is common geometry at all, and whether F says more than the homography does, is
+decided by the tests that the flags of `estimate_fundamental` come from, so that both agree; where
+too few matches are right for F, a homography may still be more than chance.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from epigauge import kernels
+from epigauge._arguments import as_count, as_matches
+from epigauge._logged import logged
+from epigauge._options import Backend
+from epigauge._results import Result
+from epigauge.errors import ArgumentError
+from epigauge.two_view.conditioning import condition
+from epigauge.two_view.consensus import RANGE, Consensus
+from epigauge.two_view.copies import earliest
+from epigauge.two_view.homography_result import HomographyResult
+from epigauge.two_view.homography_search import PlaneMixture, estimate_homography
+from epigauge.two_view.refine import calibrations
+from epigauge.two_view.robust import RobustResult, estimate_fundamental
+from epigauge.two_view.search import SCALES
+from epigauge.verdicts import ordered
+
+__all__ = ["TwoViewResult", "estimate_two_view"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+Model = Literal["nothing", "still", "rotation", "plane", "F", "E"]
+
+#: What the flags that a homography explains the matches are called as a model; the first counts.
+_MODELS: dict[str, Model] = {
+    "still camera": "still",
+    "pure rotation": "rotation",
+    "planar scene": "plane",
+}
+
+#: Parameters of each model; noise and share of right matches are two more of all but the first.
+_PARAMETERS = {"nothing": 0, "still": 0, "rotation": 3, "plane": 8, "F": 7, "E": 5}
+
+#: The noise of a homography over that of F beyond which there is relief.
+_WIDER = 1.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwoViewResult(Result):
+    """Which model of two views the matches support, and its fit.
+
+    Attributes
+    ----------
+    model : str
+        "nothing" (the matches agree no better than by chance), "still" (the camera did not move),
+        "rotation" (it only turned; without calibration a plane cannot be excluded), "plane", "F",
+        or "E" with calibration.
+    F, E, H : ndarray, shape (3, 3), or None
+        What the model has: H for a still camera, a rotation or a plane, F for "F" and "E", E for
+        "E", and for a plane with calibration.
+    R, t : ndarray, shape (3, 3) and (3,), or None
+        With calibration, the motion ``x2 = R x1 + t``, t of unit length; of a rotation R alone.
+    evidence : dict
+        For each model that was compared ``log_likelihood``, ``parameters`` and ``score``, the
+        former less ``log(m) / 2`` for each parameter; the likelihood is relative to that of wrong
+        matches alone, which is "nothing" with zero.
+    inliers : ndarray of bool, shape (m,)
+        Which matches agree with the model, duplicates included.
+    flags : tuple of str
+        Of the fit of the model, names from `epigauge.verdicts.FLAGS`.
+    success : bool
+        Whether there is a model, and its fit may be used.
+    message : str
+        The same in words.
+    """
+
+    _shown: ClassVar[tuple[str, ...]] = ("model", "F", "E", "H", "R", "t", "message")
+
+    model: Model
+    F: Array | None
+    E: Array | None
+    H: Array | None
+    R: Array | None
+    t: Array | None
+    evidence: dict[str, dict[str, float]] = field(repr=False)
+    inliers: Mask = field(repr=False)
+    flags: tuple[str, ...]
+    success: bool
+    message: str
+    _fundamental: RobustResult | None = field(repr=False)
+    _homography: HomographyResult | None = field(repr=False)
+
+    @property
+    def fit(self) -> RobustResult | HomographyResult | None:
+        """Return the whole result of the model's fit; None for "nothing"."""
+        if self.model == "nothing":
+            return None
+        return self._fundamental if self.model in ("F", "E") else self._homography
+
+    def _summary_rows(self) -> dict[str, str]:
+        found = super()._summary_rows()
+        count = f"{np.count_nonzero(self.inliers)} of {len(self.inliers)} matches"
+        scores = {name: f"{entry['score']:.1f}" for name, entry in self.evidence.items()}
+        text = ", ".join(f"{name} {score}" for name, score in scores.items())
+        return {"model": found.pop("model"), "inliers": count, "scores": text} | found
+
+
+@logged
+def estimate_two_view(
+    x1: ArrayLike,
+    x2: ArrayLike,
+    K1: ArrayLike | None = None,
+    K2: ArrayLike | None = None,
+    *,
+    seed: int = 0,
+    backend: Backend | None = None,
+) -> TwoViewResult:
+    """Tell which model of two views raw matches support, and fit it.
+
+    Parameters
+    ----------
+    x1, x2 : array_like, shape (m, 2)
+        At least eight different matches in pixels, wrong ones among them.
+    K1, K2 : array_like, shape (3, 3), optional
+        Calibration matrices: the general model is then the essential matrix. `K2` is `K1` by
+        default.
+    seed : int
+        Of everything random.
+    backend : {"c", "numpy", "casadi"}, optional
+        Where the formulas are computed.
+
+    Returns
+    -------
+    TwoViewResult
+        The model, its fit, and the evidence for all models.
+
+    Raises
+    ------
+    ArgumentError
+        On bad arguments.
+
+    Notes
+    -----
+    A right match has normal noise across its epipolar line and may be anywhere along it; of a
+    homography it has normal noise in both directions; a wrong one may be anywhere. That F also
+    explains a plane is counted: matches on the homography have the density of the plane under F,
+    too, and F is better by those off it only.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.two_view_scene(n_points=200, noise_px=0.3, seed=1)
+    >>> result = eg.estimate_two_view(scene.x1, scene.x2)
+    >>> result.model, result.success
+    ('F', True)
+    >>> eg.estimate_two_view(scene.x1, scene.x1).model
+    'still'
+    """
+    calibration = calibrations(K1 is not None or K2 is not None, K1, K2)
+    x1, x2 = as_matches(x1, x2, at_least=8, general_position=True)
+    seed = as_count("seed", seed, at_least=0)
+    try:
+        plane: HomographyResult | None = estimate_homography(x1, x2, seed=seed, backend=backend)
+    except ArgumentError:  # the best agreement is one of points on a line: no homography
+        plane = None
+    options: dict[str, Any] = {}
+    if calibration is not None:
+        options = {"essential": True, "K1": calibration[0], "K2": calibration[1]}
+    general = estimate_fundamental(x1, x2, seed=seed, backend=backend, **options)
+    name: Model = "F" if calibration is None else "E"
+    evidence, R, flat = _evidence(name, x1, x2, general, plane, calibration, backend)
+    model = _model(name, general, plane, flat)
+    usable = model != "nothing" and (general if model == name else plane).status > 0  # type: ignore[union-attr]
+    with_motion = calibration is not None and model in (name, "plane")
+    if model == name:
+        flags, inliers = general.flags, general.inlier
+        usable = usable and general.success
+    elif model == "nothing" or plane is None:
+        flags, inliers = ("no common geometry",), np.zeros(len(x1), np.bool_)
+    else:
+        own = [flag for flag in plane.flags if flag != "no common geometry"]
+        flags, inliers = ordered((*own, *_words(model))), plane.inlier
+    return TwoViewResult(
+        model=model,
+        F=general.F if model == name else None,
+        E=general.E if with_motion else None,
+        H=plane.H if plane is not None and model in _MODELS.values() else None,
+        R=R if model == "rotation" else general.R if with_motion else None,
+        t=general.t if with_motion else None,
+        evidence=evidence,
+        inliers=inliers,
+        flags=flags,
+        success=usable,
+        message=_message(model, evidence),
+        _fundamental=general,
+        _homography=plane,
+    )
+
+
+def _words(model: Model) -> list[str]:
+    """Return the flags that a model is told by."""
+    if model == "rotation":
+        return ["planar scene", "pure rotation"]
+    return [flag for flag, name in _MODELS.items() if name == model]
+
+
+def _message(model: Model, evidence: dict[str, dict[str, float]]) -> str:
+    if model == "nothing":
+        return "the matches agree no better than wrong ones do by chance"
+    ahead = evidence[model]["score"] if model in evidence else 0.0
+    return f"{model}: the logarithm of its likelihood is {ahead:.1f} above that of wrong matches"
+
+
+def _model(name: Model, general: RobustResult, plane: HomographyResult | None, flat: bool) -> Model:
+    """Return the model by the flags of both fits, and whether F explains no more than H."""
+    if plane is None or "no common geometry" in plane.flags:
+        return "nothing" if "no common geometry" in general.flags else name
+    told = {"no common geometry", *_MODELS}
+    if not flat and told.isdisjoint(general.flags):
+        return name
+    flags = {*general.flags, *plane.flags, "planar scene"}
+    return next(model for flag, model in _MODELS.items() if flag in flags)
+
+
+def _evidence(
+    name: Model,
+    x1: Array,
+    x2: Array,
+    general: RobustResult,
+    plane: HomographyResult | None,
+    calibration: tuple[Array, Array] | None,
+    backend: str | None,
+) -> tuple[dict[str, dict[str, float]], Array | None, bool]:
+    """Return the likelihoods of all models, the rotation, and whether F explains no more than H."""
+    rows = np.flatnonzero(earliest(x1, x2) == np.arange(len(x1)))
+    y1, y2 = x1[rows], x2[rows]
+    frame = condition(y1, y2)
+    table, (q1, q2) = kernels.table(backend), frame.forward(y1, y2)
+    to1, to2 = frame.maps_from_pixels()
+    m = len(rows)
+    wrong = -2.0 * m * math.log(RANGE)
+    found: dict[str, dict[str, float]] = {}
+
+    def add(model: str, logarithm: float) -> None:
+        parameters = _PARAMETERS[model] + (0 if model == "nothing" else 2)
+        gain = logarithm - wrong
+        score = gain - 0.5 * parameters * math.log(m)
+        found[model] = {"log_likelihood": gain, "parameters": parameters, "score": score}
+
+    def squares(H: Array) -> Array:
+        H = to2 @ H @ np.linalg.inv(to1)
+        with np.errstate(all="ignore"):
+            squared = table.homography_squared(H / np.linalg.norm(H), q1, q2)
+        return np.asarray(np.where(np.isfinite(squared), squared, np.inf))
+
+    add("nothing", wrong)
+    add("still", PlaneMixture.of(squares(np.eye(3)), SCALES[0]).logarithm)
+    R, squared, widest = None, np.full(m, np.inf), 0.0
+    if plane is not None:
+        squared = squares(plane.H)
+        mixture = PlaneMixture.of(squared, SCALES[0])
+        add("plane", mixture.logarithm)
+        widest = mixture.sigma
+        if calibration is not None:
+            K1, K2 = calibration
+            M = np.linalg.inv(K2) @ plane.H @ K1
+            U, _, Vt = np.linalg.svd(M * np.sign(np.linalg.det(M)))
+            R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+            turned = PlaneMixture.of(squares(K2 @ R @ np.linalg.inv(K1)), SCALES[0])
+            add("rotation", turned.logarithm)
+    agreed = Consensus(table, q1, q2).judge(frame.from_pixels(general.F), SCALES[0])
+    # Of the same noise; a plane that needs more of it has relief
+    sigma = max(agreed.sigma, min(widest, _WIDER * agreed.sigma))
+    variance = sigma**2
+    on = -0.5 * np.minimum(squared / variance, 1e6) - math.log(2.0 * math.pi * variance)
+    add(name, _general(agreed.signed, agreed.oriented, sigma, on))
+    # The epipole can be put on the lines of any two of the matches off the plane
+    chosen = 0.5 * 5.0 * math.log(m) + 2.0 * math.log(m)
+    flat = (
+        "plane" in found
+        and widest <= _WIDER * agreed.sigma
+        and found[name]["log_likelihood"] - chosen <= found["plane"]["log_likelihood"]
+    )
+    return found, R, flat
+
+
+def _general(signed: Array, oriented: Mask, sigma: float, on: Array) -> float:
+    """Return the logarithm of the likelihood of F, with a plane in it, shares being fitted."""
+    squared = np.minimum((signed / sigma) ** 2, 1e6)
+    off = -0.5 * squared - math.log(math.sqrt(2.0 * math.pi) * sigma * RANGE)
+    logs = np.stack([on, np.where(oriented, off, -np.inf), np.full(len(on), -2 * math.log(RANGE))])
+    highest = np.max(logs, axis=0)
+    densities = np.exp(logs - highest)
+    shares = np.array([0.3, 0.4, 0.3])
+    for _ in range(30):
+        parts = shares[:, None] * densities
+        shares = np.mean(parts / np.sum(parts, axis=0), axis=1)
+    return float(np.sum(highest + np.log(shares @ densities)))

@@ -1,0 +1,75 @@
+"""Which model of two views matches support."""
+
+from __future__ import annotations
+
+import epigauge as eg
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+K = np.array([[1000.0, 0.0, 640.0], [0.0, 1000.0, 480.0], [0.0, 0.0, 1.0]])
+
+
+def scene(kind: str, m: int, wrong: float, seed: int) -> tuple[Array, Array, Array]:
+    """Return matches with half a pixel of noise, the first ones wrong, and the rotation."""
+    rng = np.random.default_rng(seed)
+    rays = np.column_stack([rng.uniform(-0.6, 0.6, m), rng.uniform(-0.45, 0.45, m), np.ones(m)])
+    X = rays * rng.uniform(4.0, 8.0, m)[:, None]
+    if kind == "plane":
+        X = 6.0 * rays / (rays @ [0.3, -0.2, 1.0])[:, None]
+    angle = 0.0 if kind == "still" else 0.15
+    c, s = np.cos(angle), np.sin(angle)
+    R = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    t = np.array([0.7, 0.3, 0.2]) if kind in ("F", "plane") else np.zeros(3)
+    x1, x2 = ((Y / Y[:, 2:] @ K.T)[:, :2] for Y in (X, X @ R.T + t))
+    x1, x2 = (x + 0.5 * rng.standard_normal((m, 2)) for x in (x1, x2))
+    count = m if kind == "nothing" else round(wrong * m)
+    for x in (x1, x2):
+        x[:count] = rng.uniform([0.0, 0.0], [1280.0, 960.0], (count, 2))
+    return x1, x2, R
+
+
+@pytest.mark.parametrize("kind", ["nothing", "still", "rotation", "plane", "F"])
+@pytest.mark.parametrize("wrong", [0.0, 0.3])
+def test_the_model_is_named(kind, wrong) -> None:
+    x1, x2, _ = scene(kind, 100, wrong, 5)
+    result = eg.estimate_two_view(x1, x2)
+    assert result.model == kind
+    assert result.success == (kind != "nothing")
+    assert (result.H is not None) == (kind in ("still", "rotation", "plane"))
+    assert (result.F is not None) == (kind == "F")
+    if kind not in ("nothing", "still"):
+        assert np.count_nonzero(result.inliers[: round(wrong * 100)]) < 6
+        assert result.evidence[kind if kind != "rotation" else "plane"]["score"] > 0.0
+    assert result.evidence["nothing"]["score"] == 0.0
+
+
+def test_calibrated_cameras_give_the_motion() -> None:
+    x1, x2, R = scene("F", 150, 0.3, 6)
+    result = eg.estimate_two_view(x1, x2, K)
+    assert result.model == "E"
+    assert np.abs(result.R - R).max() < 0.01
+    x1, x2, R = scene("rotation", 150, 0.3, 7)
+    result = eg.estimate_two_view(x1, x2, K)
+    assert result.model == "rotation"
+    assert np.abs(result.R - R).max() < 0.005
+    assert result.t is None
+
+
+def test_a_result_is_plain_data_and_text(tmp_path) -> None:
+    x1, x2, _ = scene("plane", 60, 0.0, 8)
+    result = eg.estimate_two_view(x1, x2)
+    assert "plane" in str(result)
+    assert result.to_dict()["model"] == "plane"
+    result.save(tmp_path / "pair.json")
+    assert eg.load_result(tmp_path / "pair.json").model == "plane"
+
+
+def test_bad_input_is_refused() -> None:
+    x1, x2, _ = scene("F", 20, 0.0, 9)
+    with pytest.raises(eg.ArgumentError, match="at least 8"):
+        eg.estimate_two_view(x1[:5], x2[:5])
+    with pytest.raises(eg.ArgumentError, match="K1"):
+        eg.estimate_two_view(x1, x2, np.zeros((3, 3)))
