@@ -56,22 +56,25 @@ def simulated(trials: int) -> None:
 
 def measured(folder: Path) -> None:
     """Print a line a data set with known K."""
-    print("set                          focal_px     std  true   error  rms_px  seconds  flags")
+    print(f"{'set':26} focal_px     std    true   error  sigmas  rms_px  seconds  flags")
     for path in sorted(folder.glob("*/tracks.npz")):
         with np.load(path) as data:
             z = {name: data[name] for name in data.files}
-        if "K" not in z:
+        strecha = path.parent.name.startswith("strecha")
+        size = np.array([3072, 2048]) if strecha else z.get("image_size")
+        if "K" not in z or size is None:
             continue
         tracks = eg.Tracks(z["view"], z["point"], z["xy"])
-        size = z.get("image_size", np.array([3072, 2048]))
         true = np.array(z["K"]).reshape(-1, 3, 3)[0, [0, 1], [0, 1]].mean()
         begin = time.process_time()
         found = eg.metric_upgrade(tracks, image_size=size)
         seconds = time.process_time() - begin
         error = 100.0 * (found.focal_px / true - 1.0)
+        sigmas = (found.focal_px - true) / found.focal_std_px
         print(
-            f"{path.parent.name:27} {found.focal_px:9.2f} {found.focal_std_px:7.2f} {true:7.1f} "
-            f"{error:+6.2f}% {found.rms_px:7.4f} {seconds:7.2f}  {', '.join(found.flags) or '-'}"
+            f"{path.parent.name:26} {found.focal_px:9.2f} {found.focal_std_px:7.2f} {true:7.1f} "
+            f"{error:+6.2f}% {sigmas:+7.2f} {found.rms_px:7.4f} {seconds:8.2f}  "
+            f"{', '.join(found.flags) or '-'}"
         )
 
 

@@ -211,6 +211,8 @@ def camera_rows(result: eg.MetricUpgrade, cameras: eg.Cameras) -> dict[str, str]
         std = np.full(len(model.params), np.inf)
         if result.covariance is not None:
             std[: len(model.adjusted)] = np.sqrt(np.diag(result.covariance.intrinsics(c)))
+        if len(model.focal) == 1:  # not of the noise alone
+            std[model.focal[0]] = np.atleast_1d(result.focal_std_px)[c]
         for name, unit, value, sigma in zip(
             model.params, model.units, cameras.params[c], std, strict=True
         ):
