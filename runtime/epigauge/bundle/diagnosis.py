@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from epigauge.bundle.dampings import Covariant
 from epigauge.bundle.null_space import generators
+from epigauge.bundle.point_blocks import Triangle, solved_points
 from epigauge.bundle.reduced import Bordered, Iterated, reduced_system
 from epigauge.bundle.solve import BundleSystem
 from epigauge.bundle.ties import Ties, congruent
@@ -89,9 +90,8 @@ def diagnosed(
     W = Covariant().blocks(system)
     whitening = np.linalg.inv(np.swapaxes(np.linalg.cholesky(W.cameras), 1, 2))
     ties = system.ties.then(whitening, None).scaled(1.0 / np.sqrt(W.shared))
-    size = np.einsum("mii->mi", W.points)
     free = ~known
-    of_points = _open(system.V[free] / np.sqrt(size[:, :, None] * size[:, None, :])[free])
+    of_points = _open(system.V, W.points) if free.all() else _open(system.V[free], W.points[free])
     white = congruent(ties.A, system.normal.U)
     a, r = white.shape[1], ties.n_shared
     frozen = 0 if system.ties.A is None else int(np.count_nonzero(~system.ties.A.any(axis=1)))
@@ -139,15 +139,8 @@ def diagnosed(
 
 def _followed(system: BundleSystem, own: Array) -> Array:
     """Return where the points go with cameras moving by own tangents (n, d): -V^-1 W^T x."""
-    blocks = system.normal.V + 1e-12 * _sizes(system.normal.V)
     pull = system.normal.coupling.to_points(None, np.ascontiguousarray(own))
-    return -np.asarray(np.linalg.solve(blocks, pull[..., None])[..., 0])
-
-
-def _sizes(blocks: Array) -> Array:
-    """Return unit matrices as large as blocks (m, b, b)."""
-    traces = np.einsum("mii->m", blocks)[:, None, None]
-    return np.asarray(np.maximum(traces, 1e-300) * np.eye(blocks.shape[1]))
+    return -solved_points(system.normal.V, pull, 1e-12)
 
 
 def _beside_gauge(system: BundleSystem, kernels: Table, own: Array) -> Array:
@@ -176,21 +169,24 @@ def _factored(
     return None
 
 
-def _open(blocks: Array) -> int:
+def _open(blocks: Array, sizes: Array) -> int:
     """Return how many eigenvalues of blocks (k, b, b), all together, are rounding.
 
-    Eigenvalues are computed of those only whose determinant may be that of such a block: the
-    others' product is at most (trace / (b - 1))^(b - 1).
+    Where the diagonals of `sizes` are one. Eigenvalues are computed of those only whose determinant
+    may be that of such a block: the others' product is at most (trace / (b - 1))^(b - 1).
     """
     b = blocks.shape[1]
-    most = np.maximum(np.einsum("kii->k", blocks) / max(b - 1, 1), 1.0) ** (b - 1)
+    size = np.ascontiguousarray(sizes.reshape(len(sizes), b * b)[:, :: b + 1].T)
     if b == 3:
-        rows = np.cross(blocks[:, 0], blocks[:, 1])
-        determinants = np.einsum("ki,ki->k", rows, blocks[:, 2])
+        pivots = np.stack(Triangle.of(blocks)[3:]) / size
+        determinants = pivots[0] * pivots[1] * pivots[2]
+        traces = np.sum(blocks.reshape(-1, 9)[:, ::4].T / size, axis=0)
+        doubtful = ~(determinants > 100.0 * _ROUNDING * np.maximum(traces / 2.0, 1.0) ** 2)
     else:
-        determinants = np.linalg.det(blocks)
-    doubtful = blocks[~(determinants > 100.0 * _ROUNDING * most)]
-    return int(np.count_nonzero(np.linalg.eigvalsh(doubtful) <= _ROUNDING))
+        doubtful = np.ones(len(blocks), np.bool_)
+    root = np.sqrt(size[:, doubtful].T)
+    white = blocks[doubtful] / (root[:, :, None] * root[:, None, :])
+    return int(np.count_nonzero(np.linalg.eigvalsh(white) <= _ROUNDING))
 
 
 def _free_gauge(system: BundleSystem, kernels: Table) -> int:

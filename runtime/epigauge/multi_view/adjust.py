@@ -409,9 +409,11 @@ def _result(
     noise_px: float,
 ) -> BundleResult:
     """Return the result; `unit` is that of the outcome's cost in square pixels."""
+    counts = tracks.weights > 0.0
+    counted = residuals if counts.all() else residuals[counts]
     return BundleResult(
         reconstruction=reconstruction,
-        rms_px=float(np.sqrt(np.mean(residuals[tracks.weights > 0.0] ** 2))),
+        rms_px=float(np.sqrt(np.vdot(counted, counted) / counted.size)),
         cost=outcome.state.cost * unit,
         fun=residuals,
         method=method,

@@ -39,7 +39,7 @@ class Frame:
         sums = [np.bincount(tracks.view, tracks.xy[:, k]) / counts for k in (0, 1)]
         origins = np.stack(sums, axis=1)
         centred = tracks.xy - origins[tracks.view]
-        scale = float(np.sqrt(np.mean(centred**2)))
+        scale = float(np.sqrt(np.vdot(centred, centred) / centred.size))
         if not scale > 0.0:
             raise ArgumentError("tracks", "have all points of a view at one place", "other points")
         return Frame(origins, scale)

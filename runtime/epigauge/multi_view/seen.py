@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,10 +56,13 @@ class Seen:
     @staticmethod
     def of_network(tracks: Tracks) -> Seen:
         """Return what counts of tracks alone, numbers kept, with zeros for cameras and points."""
-        counts = tracks.weights > 0.0
         n, m = tracks.n_views, tracks.n_points
-        arrays = tracks.xy[counts], tracks.weights[counts], np.zeros((n, 3, 4)), np.zeros((m, 4))
-        return Seen(tracks.view[counts], tracks.point[counts], *arrays, np.arange(n), np.arange(m))
+        none = np.zeros((n, 3, 4)), np.zeros((m, 4)), np.arange(n), np.arange(m)
+        counts: Any = tracks.weights > 0.0
+        if counts.all():
+            counts = slice(None)  # no copies
+        measured = tracks.xy[counts], tracks.weights[counts]
+        return Seen(tracks.view[counts], tracks.point[counts], *measured, *none)
 
     @staticmethod
     def of(tracks: Tracks, found: Reconstruction, rejected: Mask) -> tuple[Seen, int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.bundle.point_blocks import Triangle
 from epigauge.bundle.solve import BundleSystem
 from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.multi_view.parallax import partners
@@ -35,13 +36,10 @@ def relative_depths(system: BundleSystem, noise_px: float, free: NDArray[np.bool
     """
     pose = system.cameras[:, :12].reshape(-1, 3, 4)
     middle = -np.einsum("nji,nj->ni", pose[:, :, :3], pose[:, :, 3]).mean(axis=0)
-    ray = (system.points - middle)[free]
+    ray = (system.points - middle)[free].T
     V = system.normal.V[free]
-    size = np.einsum("mii->m", V)[:, None, None]
-    V = V + 1e-14 * np.maximum(size, 1e-300) * np.eye(3)
-    distance = np.maximum(np.linalg.norm(ray, axis=1), 1e-300)
-    ray = ray / distance[:, None]
-    variance = np.einsum("mi,mi->m", ray, np.linalg.solve(V, ray[..., None])[..., 0])
+    distance = np.maximum(np.sqrt(np.sum(ray**2, axis=0)), 1e-300)
+    variance = Triangle.of(V, 1e-14).energy(ray / distance)
     return np.asarray(noise_px * np.sqrt(np.maximum(variance, 0.0)) / distance)
 
 
@@ -81,7 +79,10 @@ def _turned(seen: Seen, found: MetricReconstruction, noise_px: float) -> bool:
     asked = 0
     for i in np.unique(np.linspace(0, seen.n - 1, min(seen.n, 10)).astype(np.intp)):
         for k in partners(seen, begin, int(i)):
-            common = np.intersect1d(seen.point[seen.view == i], seen.point[seen.view == k])
+            both = np.zeros((2, seen.m), np.bool_)
+            for side, one in enumerate((i, k)):
+                both[side, seen.point[seen.view == one]] = True
+            common = np.flatnonzero(both[0] & both[1])
             a, b = (found.X[common] - centres[one] for one in (i, k))
             a, b = (
                 v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-300) for v in (a, b)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["gross_flags", "has_gross_errors"]
+__all__ = ["gross_flags"]
 
 Array = NDArray[np.float64]
 
@@ -41,11 +43,13 @@ def gross_flags(distances: Array, noise_px: float, xy: Array) -> tuple[str, ...]
     xy : ndarray, shape (N, 2)
         Where they were measured.
     """
-    if has_gross_errors(distances, noise_px, xy):
-        return ("gross errors",)
-    if distances.max() <= _NEAR * noise_px:
+    largest = distances.max()
+    if largest <= _NEAR * noise_px:  # the extent can only raise the bounds
         return ()
-    usual, N = max(noise_px, _EXACT * _extent(xy)), len(distances)
+    extent, N = _extent(xy), len(distances)
+    if _spoiled(distances, noise_px, extent):
+        return ("gross errors",)
+    usual = max(noise_px, _EXACT * extent)
     near, far = (int(np.count_nonzero(distances > k * usual)) for k in (_NEAR, _FAR))
     # Of normal errors exp(-8) are beyond four standard deviations.
     chance = N * float(np.exp(-0.5 * _NEAR**2))
@@ -56,11 +60,8 @@ def gross_flags(distances: Array, noise_px: float, xy: Array) -> tuple[str, ...]
     return ("outliers",) if left else ()
 
 
-def has_gross_errors(distances: Array, noise_px: float, xy: Array) -> bool:
+def _spoiled(distances: Array, noise_px: float, extent: float) -> bool:
     """Tell whether few residuals carry the cost, or more than a very few are very large."""
-    if distances.max() <= _HEAVY * noise_px:  # the extent can only raise the bounds
-        return False
-    extent = _extent(xy)
     usual = _HEAVY * max(noise_px, _EXACT * extent)
     heavy = float(np.sqrt(np.mean(distances**2) / 2.0)) > usual
     beyond = np.count_nonzero(distances > max(_BEYOND * extent, usual))
@@ -69,5 +70,14 @@ def has_gross_errors(distances: Array, noise_px: float, xy: Array) -> bool:
 
 def _extent(xy: Array) -> float:
     """Return the range of the coordinates, to which a few wild ones add little."""
-    low, high = np.quantile(xy, (0.005, 0.995), axis=0)
-    return float(np.minimum(np.ptp(xy, axis=0), 1.3 * (high - low)).max())
+    last = len(xy) - 1
+    places = [share * last for share in (0.005, 0.995)]
+    kept = sorted(
+        {0, last, *(k for place in places for k in (math.floor(place), math.ceil(place)))}
+    )
+    extents = []
+    for values in xy.T:  # several times as fast as a quantile of rows
+        rising = np.partition(values, kept)
+        low, high = np.interp(places, kept, rising[kept])
+        extents.append(min(rising[last] - rising[0], 1.3 * (high - low)))
+    return float(max(extents))

@@ -22,7 +22,7 @@ from epigauge.multi_view.verdicts.perspective import affine_views
 from epigauge.multi_view.verdicts.relief import flatness
 from epigauge.multi_view.verdicts.shape import flat_scene, one_line
 from epigauge.multi_view.verdicts.verdict import Verdict
-from epigauge.multi_view.verdicts.words import largest, named, of_points, shares_of
+from epigauge.multi_view.verdicts.words import largest, named, of_points, tangent_sizes
 from epigauge.two_view.losses import median
 from epigauge.verdicts import ordered
 
@@ -93,19 +93,22 @@ def judged_metric(
     if isinstance(system, BundleSystem) and np.isfinite(outcome.state.cost):
         diagnosis = diagnosed(system, kernels, known, fixes_gauge)
         rank, condition = diagnosis.rank, diagnosis.condition
-        counts = tracks.weights > 0.0
-        share_free = max(1.0 - rank / max(2 * int(np.count_nonzero(counts)), 1), 1e-3)
-        r = whitened(tracks.whitening, (tracks.xy - predicted).T)
-        distances = (np.sqrt(tracks.weights) * np.linalg.norm(r, axis=0))[counts]
+        counts, xy, scale = tracks.weights > 0.0, tracks.xy, Frame.of(tracks).scale
+        r = whitened(tracks.whitening, (xy - predicted).T)
+        distances = np.sqrt(tracks.weights * (r[0] ** 2 + r[1] ** 2))
+        if not counts.all():
+            distances, xy = distances[counts], xy[counts]
+        share_free = max(1.0 - rank / max(2 * len(distances), 1), 1e-3)
         # Of two normal coordinates, the median distance is 1.1774 standard deviations.
         usual = median(distances) / 1.1774 / float(np.sqrt(share_free))
         if bends:
-            raised.update(gross_flags(distances, usual, tracks.xy[counts]))
+            raised.update(gross_flags(distances, usual, xy))
         noise_px = float(np.sqrt(np.sum(distances**2) / share_free / max(2 * len(distances), 1)))
         # Affine cameras are computed with in other units of the image.
-        noise = noise_px if metric else noise_px / Frame.of(tracks).scale
-        weakest = named(system, shares_of(system, noise * np.abs(diagnosis.cameras)))
-        shares = shares_of(system, noise * diagnosis.spread)
+        noise = noise_px if metric else noise_px / scale
+        sizes = tangent_sizes(system)
+        weakest = named(system, noise * np.abs(diagnosis.cameras) / sizes)
+        shares = noise * diagnosis.spread / sizes
         if diagnosis.open is not None:
             weakest = f"{largest(system, np.abs(diagnosis.open))} (undetermined)"
         group = of_points(diagnosis.points)
@@ -117,9 +120,13 @@ def judged_metric(
         elif flat > _WEAK or worst > _UNCERTAIN:
             raised.add("weak geometry")
         # Where the fit is bad, nothing is within its noise.
-        if isinstance(found, MetricReconstruction) and usual < _FITS * Frame.of(tracks).scale:
-            told = worst > _UNCERTAIN
-            raised.update(_causes(tracks, found, predicted, system, diagnosis, usual, told, known))
+        if isinstance(found, MetricReconstruction) and usual < _FITS * scale:
+            least, told = max(usual, 1e-9 * scale), worst > _UNCERTAIN
+            shares = least * diagnosis.spread / sizes
+            causes = _causes(
+                tracks, found, predicted, system, diagnosis, least, shares, told, known
+            )
+            raised.update(causes)
     return Verdict(ordered(raised), rank, n_behind, condition, weakest)
 
 
@@ -130,18 +137,15 @@ def _causes(
     system: BundleSystem,
     diagnosis: Diagnosis,
     noise_px: float,
+    shares: Array,
     weak: bool,
     known: Mask,
 ) -> tuple[str, ...]:
     """Return what makes calibrated cameras weak, by name."""
-    least = 1e-9 * Frame.of(tracks).scale
-    noise_px = max(noise_px, least)
     free = system.ties.n_shared > 0 or _refines(system)
     depths = relative_depths(system, noise_px, ~known)
     raised = list(distance_flags(tracks, found, depths, noise_px))
-    counts = tracks.weights > 0.0
-    shares = shares_of(system, noise_px * diagnosis.spread)[:, _POSE:]
-    opened = shares.max(initial=0.0) > _UNCERTAIN
+    opened = shares[:, _POSE:].max(initial=0.0) > _UNCERTAIN
     if diagnosis.open is not None:
         size = np.abs(diagnosis.open)
         opened = opened or size[:, _POSE:].max(initial=0.0) > _PART * size.max()
@@ -149,9 +153,7 @@ def _causes(
         raised.append("open intrinsics")
     if free and flat_scene(system, noise_px):
         raised.append("flat scene")
-    if affine_views(
-        tracks.view[counts], found.X[tracks.point[counts]], predicted[counts], noise_px
-    ):
+    if affine_views(tracks, found.X, predicted, noise_px):
         raised.append("near-affine")
     if (weak or diagnosis.missing or diagnosis.gauge == 1) and one_line(found.centres):
         raised.append("collinear centres")

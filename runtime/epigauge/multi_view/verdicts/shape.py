@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.bundle.point_blocks import Triangle
 from epigauge.bundle.solve import BundleSystem
+from epigauge.two_view.losses import median
 
 __all__ = ["flat_scene", "one_line"]
 
@@ -21,14 +23,11 @@ _LINE = 0.01
 def flat_scene(system: BundleSystem, noise_px: float) -> bool:
     """Tell whether all points lie in one plane, within what the noise makes of them."""
     X = system.points - system.points.mean(axis=0)
-    _, values, axes = np.linalg.svd(X, full_matrices=False)
-    V = system.normal.V
-    size = np.maximum(np.einsum("mii->m", V), 1e-300)[:, None, None]
-    normals = np.broadcast_to(axes[2][:, None], (len(V), 3, 1))
-    across = np.linalg.solve(V + 1e-14 * size * np.eye(3), normals)[..., 0] @ axes[2]
-    noise = noise_px * np.sqrt(np.median(np.maximum(across, 0.0)))
-    thickness = values[2] / np.sqrt(len(X))
-    return bool(thickness <= max(_THICK * noise, _THIN * values[0] / np.sqrt(len(X))))
+    values, axes = np.linalg.eigh(X.T @ X / len(X))
+    across = Triangle.of(system.normal.V, 1e-14).energy(axes[:, :1])
+    noise = noise_px * np.sqrt(max(median(across), 0.0))
+    thickness, extent = np.sqrt(np.maximum(values[[0, 2]], 0.0))
+    return bool(thickness <= max(_THICK * noise, _THIN * extent))
 
 
 def one_line(centres: Array) -> bool:

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.bundle.solve import BundleSystem
+from epigauge.two_view.losses import median
 
-__all__ = ["largest", "named", "of_points", "of_views", "shares_of"]
+__all__ = ["largest", "named", "of_points", "of_views", "tangent_sizes"]
 
 Array = NDArray[np.float64]
 
@@ -22,21 +23,21 @@ def largest(system: BundleSystem, sizes: Array) -> str:
     return ", ".join(f"{names[k]} of view {i}" for i, k in zip(views, entries, strict=True))
 
 
-def shares_of(system: BundleSystem, deviations: Array) -> Array:
-    """Return standard deviations of own tangents (n, d) as shares of their sizes.
+def tangent_sizes(system: BundleSystem) -> Array:
+    """Return the sizes of own tangents (n, d), of which standard deviations are shares.
 
     Turns are in radians, moves as shares of the median distance of the points, focal lengths and
     other parameters in their unit as shares of the focal length; all others count for nothing.
     Affine cameras are as they are computed with: points of unit covariance, images of RMS one.
     """
-    sizes = np.ones(deviations.shape)
+    sizes = np.ones(system.normal.g_cameras.shape)
     if system.model.metric:
         _set_sizes(sizes, system)
-    return np.asarray(deviations / sizes)
+    return sizes
 
 
 def named(system: BundleSystem, shares: Array) -> str:
-    """Return the three largest of `shares_of` by name."""
+    """Return the three largest shares of `tangent_sizes` (n, d) by name."""
     views, entries = np.unravel_index(np.argsort(-shares, axis=None)[:3], shares.shape)
     return ", ".join(
         f"{system.model.tangent_names[k]} of view {i} ({100.0 * shares[i, k]:.2g} %)"
@@ -55,12 +56,16 @@ def of_views(parts: Array, views: NDArray[np.intp]) -> str:
 
 def of_points(motion: Array) -> str:
     """Return the group of points that has nearly all of a motion (m, b), or nothing."""
-    squares = np.sum(motion**2, axis=1)
-    order = np.argsort(-squares, kind="stable")
-    if not 0.0 < squares.sum() < np.inf:
+    squares = np.sum(motion.T**2, axis=0)
+    most, enough = int(_GROUP * len(squares)), _NEARLY * float(squares.sum())
+    if not (most and 0.0 < enough < np.inf):
         return ""
-    count = 1 + int(np.searchsorted(np.cumsum(squares[order]), _NEARLY * squares.sum()))
-    if count > _GROUP * len(motion):
+    of_half = np.partition(squares, len(squares) - most)[-most:]
+    if of_half.sum() < enough:
+        return ""
+    order = np.argsort(-squares, kind="stable")
+    count = 1 + int(np.searchsorted(np.cumsum(squares[order]), enough))
+    if count > most:
         return ""
     listed = ", ".join(map(str, sorted(order[: min(count, 5)].tolist())))
     return f"points {listed}{' ...' if count > 5 else ''} ({count} of {len(motion)})"
@@ -71,7 +76,8 @@ def _set_sizes(sizes: Array, system: BundleSystem) -> None:
     model, cameras = system.model, system.cameras
     pose = cameras[:, :12].reshape(-1, 3, 4)
     centres = -np.einsum("nji,nj->ni", pose[:, :, :3], pose[:, :, 3])
-    extent = np.median(np.linalg.norm(system.points - centres.mean(axis=0), axis=1))
+    offsets = system.points.T - centres.mean(axis=0)[:, None]
+    extent = np.sqrt(median(np.sum(offsets**2, axis=0)))
     sizes[:, 3:6] = max(float(extent), 1e-300)
     focal = cameras[:, 12:][:, list(model.focal)]
     sizes[:, 6:] = focal.mean(axis=1, keepdims=True) if focal.size else np.inf
