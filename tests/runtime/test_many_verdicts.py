@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
+import pickle
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -220,3 +222,38 @@ def test_words_of_the_message_come_from_the_vocabulary() -> None:
     for name in spoiling:
         assert name in found.message
     assert "lambda" not in found.message
+
+
+class TestVerdictWhenAsked:
+    """The verdict waits until it is asked for, and is that on what was found."""
+
+    @staticmethod
+    def found() -> eg.BundleResult:
+        scene = eg.multi_view_scene(n_points=30, seed=2)
+        return eg.bundle_adjust(scene.tracks, eg.initialize(scene.tracks))
+
+    def test_all_its_fields_are_there_once_one_was_asked_for(self) -> None:
+        result = self.found()
+        assert "flags" not in vars(result)
+        assert result.success
+        assert result.message
+        assert "_judge" not in vars(result)
+        assert result.flags == ()
+        assert result.rank == 11 * 5 + 3 * 30 - 15
+
+    def test_writing_to_the_result_does_not_change_it(self) -> None:
+        result, untouched = self.found(), self.found()
+        result.reconstruction.P[:] = 1.0
+        assert result.condition == untouched.condition
+        assert result.flags == untouched.flags
+
+    def test_copies_and_pickles_are_judged(self) -> None:
+        found = self.found
+        pickled = pickle.loads(pickle.dumps(found()))  # noqa: S301
+        for made in (copy.copy(found()), copy.deepcopy(found()), pickled):
+            assert "flags" in vars(made)
+            assert "_judge" not in vars(made)
+
+    def test_what_no_result_has_is_no_attribute(self) -> None:
+        with pytest.raises(AttributeError, match="no attribute 'weight'"):
+            getattr(self.found(), "weight")  # noqa: B009

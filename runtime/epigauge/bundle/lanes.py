@@ -111,6 +111,9 @@ class LaneLayout:
         Once for passes over the observations, once for those over pairs of observations of a
         point; little work makes fewer ranges.
         """
+        if count == 1:
+            whole = [(0, len(self.lanes) - 1)]
+            return whole, whole
         rows, lanes = np.diff(self.rows), np.diff(self.lanes)
         pairs = rows * (rows // lanes + _PASSES)
         count = max(1, min(count, int(pairs.sum() / _SHARE)))

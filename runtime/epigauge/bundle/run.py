@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -128,6 +129,9 @@ def minimized(
 ) -> tuple[lm.Outcome[BundleState], Array, Array]:
     """Minimise by a method; return how it ended, and cameras and points in the gauge of the result.
 
+    Normal equations that were not needed to the end are made when the `system` of the outcome is
+    called.
+
     Raises
     ------
     ArgumentError
@@ -221,7 +225,8 @@ def minimized(
         outcome = minimize(problem, begun, act, schedule(), stopping, callback, unit)
         outcome = problem.fetched(outcome)
         if homogeneous and home and outcome.system is None and np.isfinite(outcome.state.cost):
-            outcome = replace(outcome, system=problem.linearize(outcome.state))
+            later: Any = partial(problem.linearize, outcome.state)
+            outcome = replace(outcome, system=later)
         found = outcome.state.cameras, outcome.state.points
         claims = homogeneous and outcome.status > 0 and not jumps
         if claims and not checked(*found, outcome.state, begun):

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from epigauge import kernels, lm
 from epigauge._arguments import as_choice, as_count, as_positive
 from epigauge._logged import logged
 from epigauge._options import Backend, BundleDamping, GaugeMode, Method, Schedule
 from epigauge._options import Loss as LossName
-from epigauge._results import Result
 from epigauge.bundle.dampings import DAMPINGS
 from epigauge.bundle.jobs import job_of
 from epigauge.bundle.observations import ObservationGraph
@@ -25,138 +22,28 @@ from epigauge.bundle.run import checked_gauge, minimized
 from epigauge.bundle.strategies import STRATEGIES
 from epigauge.cameras import AffineReconstruction, AnyReconstruction, MetricReconstruction
 from epigauge.errors import ArgumentError
+from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import Gauge
 from epigauge.multi_view.initialize import initialize
 from epigauge.multi_view.measured import whitened
 from epigauge.multi_view.prior_noise import with_estimated_noise
+from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.rejection import without_gross_errors
 from epigauge.multi_view.repeated import merging_sightings
+from epigauge.multi_view.result import BundleResult
 from epigauge.multi_view.tracks import Tracks
 from epigauge.multi_view.verdicts.metric import judged_metric
 from epigauge.multi_view.verdicts.projective import judged
 from epigauge.multi_view.verdicts.verdict import Verdict
 from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
-from epigauge.verdicts import FLAGS, usable
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["BundleResult", "bundle_adjust"]
-
-Array = NDArray[np.float64]
 
 _SCHEDULES: dict[str, Callable[[], lm.Schedule]] = {
     "classic": lm.Classic,
     "nielsen": lm.Nielsen,
     "adaptive": lm.Adaptive,
 }
-
-
-@dataclass(frozen=True)
-class BundleResult(Result):
-    """An adjusted reconstruction and how it was found. All lengths are in pixels.
-
-    Attributes
-    ----------
-    reconstruction : Reconstruction, MetricReconstruction or AffineReconstruction
-        Cameras and points, of the kind of the start; with method "covariant" in its basis.
-    rms_px : float
-        sqrt(sum of squared residual coordinates / (2 N)), of the N observations whose weight is not
-        zero and that were not set aside.
-    cost : float
-        0.5 * (weighted, robust) sum of squared residuals, in px^2.
-    fun : ndarray, shape (N, 2)
-        Residuals q - q_hat, in the order of the tracks.
-    method : str
-        Name of the strategy.
-    loss_scale_px : float
-        Scale of the robust loss; 0 for the linear loss.
-    noise_px : float
-        Noise of the image that priors were weighed with, given or estimated.
-    flags : tuple of str
-        What can be said against it, from `epigauge.verdicts.FLAGS`; `success` is False with one
-        that spoils a reconstruction.
-    rank : int
-        Of the normal matrix: 11 n + 3 m - 15 where the observations determine everything, m being
-        the points with two observations that count.
-    n_behind : int
-        Observations of points that do not lie in front of their camera; they keep the residual that
-        the camera's formula gives.
-    rejected : ndarray of bool, shape (N,)
-        Observations that were set aside as gross errors, in the order of the tracks.
-    condition : float
-        Beside the gauge, the inverse of the least eigenvalue of the reduced normal matrix: of
-        metric cameras scaled to a unit diagonal, of projective ones where the W of the covariant
-        damping is one. Infinite where something is undetermined or the system is not factored.
-    weakest : str
-        The direction of that eigenvalue in words: of metric and affine cameras its three largest
-        standard deviations, as shares of a radian, of the scene's size, or of the focal length, and
-        the group of points that moves with it; of projective ones the views with most part in it.
-        Where nothing determines a direction, what moves most along it.
-    nfev, njev, nit, status, message, success, history
-        As in `FundamentalResult`.
-    """
-
-    _shown: ClassVar[tuple[str, ...]] = (
-        *("reconstruction", "rms_px", "cost", "method", "noise_px", "n_behind", "condition"),
-        *("nfev", "message"),
-    )
-
-    reconstruction: AnyReconstruction = field(repr=False)
-    rms_px: float
-    cost: float
-    fun: Array = field(repr=False)
-    method: str
-    loss_scale_px: float
-    noise_px: float
-    flags: tuple[str, ...]
-    rank: int
-    n_behind: int
-    rejected: NDArray[np.bool_] = field(repr=False)
-    condition: float
-    weakest: str
-    nfev: int
-    njev: int
-    nit: int
-    status: int
-    message: str
-    success: bool
-    history: tuple[lm.Row, ...] = field(repr=False)
-
-    def _summary_rows(self) -> dict[str, str]:
-        aside = f"{np.count_nonzero(self.rejected)} of {len(self.rejected)} observations"
-        rows = super()._summary_rows()
-        return rows | ({"set aside": aside} if self.rejected.any() else {})
-
-    def plot(self, tracks: Tracks, title: str = "", **options: Any) -> Figure:
-        """Draw cameras and points from three sides, the residuals, and the convergence.
-
-        Parameters
-        ----------
-        tracks : Tracks
-            What was adjusted.
-        title : str
-            What to call them.
-        **options
-            Of `epigauge.plots.plot_bundle`.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            The picture; `epigauge.plots.save_figure` writes it.
-
-        Raises
-        ------
-        MissingPackageError
-            If Matplotlib is not installed.
-
-        Examples
-        --------
-        >>> result.plot(tracks)  # doctest: +SKIP
-        """
-        from epigauge.plots import plot_bundle
-
-        return plot_bundle(self, tracks, title, **options)
 
 
 @logged
@@ -371,7 +258,6 @@ def bundle_adjust(
         callback=callback,
     )
     reconstruction = job.result(cameras, points)
-    rejected = np.zeros(len(tracks), dtype=np.bool_)
     stays = (
         fixed_indices("fixed_views", fixed_views, tracks.n_views),
         fixed_indices("fixed_points", fixed_points, tracks.n_points),
@@ -385,61 +271,46 @@ def bundle_adjust(
         else:
             predicted, depths = reconstruction.project(tracks), None
         free = fixed, job.fixes_gauge or reference, predicted, loss == "linear"
-        verdict = judged_metric(tracks, reconstruction, depths, outcome, table, *free)
+        frame = Frame.of(tracks)
+
+        def judge() -> Verdict:
+            return judged_metric(tracks, frame, reconstruction, depths, outcome, table, *free)
+
     else:
         linear = loss == "linear"
-        how = linear, table, threads, stays if job.fixes_gauge else None
-        verdict = judged(tracks, reconstruction, rejected, *how, outcome.system if linear else None)
         predicted = reconstruction.project(tracks)
-    unit, residuals = job.scale_px**2, tracks.xy - predicted
-    parts = outcome, unit, verdict, rejected, method, scale_px, noise_px
-    return _result(tracks, reconstruction, residuals, *parts)
+        how = linear, table, threads, stays if job.fixes_gauge else None
 
+        def judge() -> Verdict:
+            # The arrays of the result can be written to: what is judged is what was found.
+            found, none = job.result(cameras, points), np.zeros(len(tracks), np.bool_)
+            assert isinstance(found, Reconstruction)
+            system: Any = outcome.system if linear else None
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                system = system() if callable(system) else system
+            return judged(tracks, found, none, *how, system)
 
-def _result(
-    tracks: Tracks,
-    reconstruction: AnyReconstruction,
-    residuals: NDArray[np.float64],
-    outcome: lm.Outcome[Any],
-    unit: float,
-    verdict: Verdict,
-    rejected: NDArray[np.bool_],
-    method: str,
-    scale_px: float,
-    noise_px: float,
-) -> BundleResult:
-    """Return the result; `unit` is that of the outcome's cost in square pixels."""
-    counts = tracks.weights > 0.0
+    residuals, counts = tracks.xy - predicted, tracks.weights > 0.0
     counted = residuals if counts.all() else residuals[counts]
-    return BundleResult(
+    result = BundleResult.unjudged(
+        judge,
         reconstruction=reconstruction,
         rms_px=float(np.sqrt(np.vdot(counted, counted) / counted.size)),
-        cost=outcome.state.cost * unit,
+        cost=outcome.state.cost * job.scale_px**2,
         fun=residuals,
         method=method,
         loss_scale_px=scale_px,
         noise_px=noise_px,
-        flags=verdict.flags,
-        rank=verdict.rank,
-        n_behind=verdict.n_behind,
-        condition=verdict.condition,
-        weakest=verdict.weakest,
-        rejected=rejected,
+        rejected=np.zeros(len(tracks), dtype=np.bool_),
         nfev=outcome.nfev,
         njev=outcome.njev,
         nit=outcome.nit,
         status=outcome.status,
-        message=_message(outcome.status, verdict.flags),
-        success=outcome.status > 0 and usable(verdict.flags, "views"),
         history=outcome.history,
     )
-
-
-def _message(status: int, flags: tuple[str, ...]) -> str:
-    """Return why the adjustment stopped and, where its result must not be used, why not."""
-    spoiling = [name for name in flags if not usable([name], "views")]
-    reasons = [f"{name}: {FLAGS[name].sentence}" for name in spoiling]
-    return "; but ".join([lm.STATUS[status], *reasons])
+    if threads is not workers:
+        result.judge()  # while the workers are there
+    return result
 
 
 def _loss_scale(

@@ -57,12 +57,14 @@ class Seen:
     def of_network(tracks: Tracks) -> Seen:
         """Return what counts of tracks alone, numbers kept, with zeros for cameras and points."""
         n, m = tracks.n_views, tracks.n_points
-        none = np.zeros((n, 3, 4)), np.zeros((m, 4)), np.arange(n), np.arange(m)
+        P, Q = np.zeros((n, 3, 4)), np.zeros((m, 4))
         counts: Any = tracks.weights > 0.0
         if counts.all():
             counts = slice(None)  # no copies
         measured = tracks.xy[counts], tracks.weights[counts]
-        return Seen(tracks.view[counts], tracks.point[counts], *measured, *none)
+        return Seen(
+            tracks.view[counts], tracks.point[counts], *measured, P, Q, np.arange(n), np.arange(m)
+        )
 
     @staticmethod
     def of(tracks: Tracks, found: Reconstruction, rejected: Mask) -> tuple[Seen, int]:

@@ -47,6 +47,7 @@ _UNCERTAIN = 0.1
 
 def judged_metric(
     tracks: Tracks,
+    frame: Frame,
     found: MetricReconstruction | AffineReconstruction,
     depths: Array | None,
     outcome: lm.Outcome[BundleState],
@@ -62,6 +63,8 @@ def judged_metric(
     ----------
     tracks : Tracks
         Observations.
+    frame : Frame
+        Of these.
     found : MetricReconstruction or AffineReconstruction
         Cameras and points, at the minimum.
     depths : ndarray, shape (N,), or None
@@ -93,7 +96,7 @@ def judged_metric(
     if isinstance(system, BundleSystem) and np.isfinite(outcome.state.cost):
         diagnosis = diagnosed(system, kernels, known, fixes_gauge)
         rank, condition = diagnosis.rank, diagnosis.condition
-        counts, xy, scale = tracks.weights > 0.0, tracks.xy, Frame.of(tracks).scale
+        counts, xy, scale = tracks.weights > 0.0, tracks.xy, frame.scale
         r = whitened(tracks.whitening, (xy - predicted).T)
         distances = np.sqrt(tracks.weights * (r[0] ** 2 + r[1] ** 2))
         if not counts.all():
