@@ -21,6 +21,10 @@ _STANDS = 1e-6
 #: Fours of matches that it is tried from: with half of them on the plane one in sixteen is clean.
 _SAMPLES = 40
 
+#: Weights fall at the median distance while the plane is looked for, which is sharp; once it is
+#: found, at so many times the median square: few matches would bend to half of themselves.
+_SHARP, _WIDE = 1.0, 4.0
+
 #: A distance below this, in conditioned coordinates, is rounding.
 _ROUNDING = 1e-8
 
@@ -77,16 +81,17 @@ def robust_homography(
     H : ndarray, shape (3, 3)
         Homography of unit Frobenius norm.
     squares : ndarray, shape (n,)
-        Squared distance of each match, in both images; their median is the lowest found.
+        Squared distance of each match, in both images.
     """
     table = table or kernels.table()
     starts = (weights, _near_a_sample(table, q1, q2, weights))
-    ends = [_reweighted(table, q1, q2, weights, own) for own in starts]
-    return min(ends, key=lambda end: median(end[1]))
+    ends = [_reweighted(table, q1, q2, weights, own, _SHARP) for own in starts]
+    squares = min((end[1] for end in ends), key=median)
+    return _reweighted(table, q1, q2, weights, _falling(weights, squares, _WIDE), _WIDE)
 
 
 def _reweighted(
-    table: Table, q1: Array, q2: Array, weights: Array, own: Array
+    table: Table, q1: Array, q2: Array, weights: Array, own: Array, reach: float
 ) -> tuple[Array, Array]:
     """Fit with weights, and again with those that the distances give."""
     H, last = _EQUAL, np.inf
@@ -96,9 +101,14 @@ def _reweighted(
         middle = _middle(squares)
         if abs(middle - last) <= _STANDS * middle:
             break
-        with np.errstate(over="ignore"):  # infinitely far: no weight
-            own, last = weights / (1.0 + squares / middle) ** 2, middle
+        own, last = _falling(weights, squares, reach), middle
     return H, squares
+
+
+def _falling(weights: Array, squares: Array, reach: float) -> Array:
+    """Return weights that fall where squares are so many times their median."""
+    with np.errstate(over="ignore"):  # infinitely far: no weight
+        return np.asarray(weights / (1.0 + squares / (reach * _middle(squares))) ** 2)
 
 
 def _least(table: Table, H: Array, q1: Array, q2: Array, weights: Array) -> tuple[Array, Array]:
@@ -116,8 +126,7 @@ def _near_a_sample(table: Table, q1: Array, q2: Array, weights: Array) -> Array:
     candidates = np.linalg.svd(_equations(q1[:, four], q2[:, four]))[2][:, 8].reshape(-1, 3, 3)
     tried = [table.homography_squared(H, q1, q2) for H in candidates]
     best = min(tried, key=median)
-    with np.errstate(over="ignore"):
-        return np.asarray(weights / (1.0 + best / _middle(best)) ** 2)
+    return _falling(weights, best, _SHARP)
 
 
 def _middle(squares: Array) -> float:
