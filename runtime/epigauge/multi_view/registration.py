@@ -44,6 +44,10 @@ Indices = NDArray[np.intp]
 #: Known views whose matches a camera without known points is found from, at most.
 _PARTNERS = 10
 
+#: A camera found from points that half are held by so many views already bends nothing: with gross
+#: errors, everything is then adjusted when there are so many times the views only.
+_HELD, _GROWN = 8, 1.2
+
 
 def registered(
     tracks: Tracks, frame: Frame, kernels: Table, incremental: bool, robust: bool
@@ -61,7 +65,8 @@ def registered(
     incremental : bool
         Adjust everything known with each camera.
     robust : bool
-        Take what most observations agree on, and adjust everything known with each camera.
+        Take what most observations agree on, and adjust everything known with each camera that
+        sees points which few others hold.
 
     Returns
     -------
@@ -77,9 +82,10 @@ def registered(
     builder = _Builder(tracks, frame.conditioned(tracks), kernels, robust)
     builder.begin(*best_pair(tracks, frame, robust))
     while not builder.registered.all():
-        builder.register(builder.next_view())
+        view = builder.next_view()
+        builder.register(view)
         # Gross errors bend what hangs on a few cameras, and at the end of a long sequence it does.
-        if incremental or robust:
+        if incremental or (robust and not builder.held(view)):
             builder.adjust()
     return Reconstruction(frame.cameras_out(builder.P), builder.Q)
 
@@ -93,6 +99,7 @@ class _Builder:
         self.Q = np.zeros((tracks.n_points, 4))
         self.registered = np.zeros(tracks.n_views, dtype=np.bool_)
         self.known = np.zeros(tracks.n_points, dtype=np.bool_)
+        self.adjusted = 0
 
     def begin(self, i: int, k: int) -> None:
         """Start with two views."""
@@ -197,8 +204,18 @@ class _Builder:
             ) from None
         return result.F, result.points, points[agrees]
 
+    def held(self, view: int) -> bool:
+        """Tell whether a new view hangs on many others, nearly as many as when last adjusted."""
+        count = np.count_nonzero(self.registered)
+        if self.registered.all() or count >= _GROWN * self.adjusted:
+            return False
+        known = self.registered[self.tracks.view]
+        views = np.bincount(self.tracks.point[known], minlength=self.tracks.n_points)
+        return bool(np.median(views[self.tracks.point[self.tracks.view == view]]) >= _HELD)
+
     def adjust(self) -> None:
         """Adjust all registered cameras and known points by a few robust covariant steps."""
+        self.adjusted = int(np.count_nonzero(self.registered))
         rows = np.flatnonzero(self.registered[self.tracks.view] & self.known[self.tracks.point])
         views, local_views = np.unique(self.tracks.view[rows], return_inverse=True)
         points, local_points = np.unique(self.tracks.point[rows], return_inverse=True)
