@@ -68,8 +68,8 @@ def initialize(
         Against gross errors in the tracks, ten per cent or more. When registering: F, cameras and
         points are those that most observations agree on, among many proposed by a few, and what
         is known is adjusted with each camera that hangs on few others. (Without, a Cauchy loss with
-        an estimated scale bears with few gross errors.) When factoring: weigh them down. Without them, the plain
-        factorization leads to the best minimum more often.
+        an estimated scale bears with few gross errors.) When factoring: weigh them down. Without
+        them, the plain factorization leads to the best minimum more often.
     seed : int
         When factoring, of the random cameras: another one is another chance.
     backend : {"c", "numpy", "casadi"}, optional
