@@ -10,6 +10,7 @@ for each pair of observations of one point, and the Cholesky factor of the camer
 its envelope. The factors of rank one and two that the library multiplies instead need an eighth of
 it; so it may come below. Shares of the time are those of a run with one thread, by function of the
 C library.
+The total is that of `bundle_adjust`, without the verdict, which is made when it is asked for.
 """
 
 from __future__ import annotations
