@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import sys
 import zlib
@@ -368,3 +369,41 @@ def test_thumbnails_show_the_same_smaller(tmp_path, shape) -> None:
     assert max(small.shape[:2]) == min(100, max(shape[:2]))
     assert small.shape[0] / small.shape[1] == pytest.approx(shape[0] / shape[1], abs=0.02)
     assert abs(int(np.atleast_1d(small[5, 5])[0]) - int(np.atleast_1d(image[0, 0])[0])) < 60
+
+
+def heic(image: np.ndarray) -> bytes:
+    """Return an RGB or grey image as a HEIC file."""
+    heif = pytest.importorskip("pillow_heif", reason="HEIC needs pillow-heif")
+    height, width = image.shape[:2]
+    mode = "RGB" if image.ndim == 3 else "L"
+    file = heif.from_bytes(mode, (width, height), np.ascontiguousarray(image).tobytes())
+    target = io.BytesIO()
+    file.save(target, quality=-1)
+    return target.getvalue()
+
+
+def test_photographs_of_telephones_are_read(small, tmp_path) -> None:
+    path = tmp_path / "IMG_0001.HEIC"
+    for image in (small[0], small[0][:, :, 0]):
+        path.write_bytes(heic(image))
+        found = eg.load_image(path)
+        assert found.dtype == np.uint8
+        assert found.shape[:2] == image.shape[:2]
+        shown = image if found.ndim == image.ndim else image[:, :, None]
+        # Colours are stored at half the resolution: means of 4 x 4 pixels are compared.
+        off = (found.astype(float) - shown)[:240, :280].reshape(60, 4, 70, 4, -1).mean(axis=(1, 3))
+        assert np.abs(off).max() < 12.0
+        assert np.abs(off).mean() < 2.0
+    data = heic(small[0])
+    for damaged in (data[:200], data[: len(data) // 2], data[:40] + bytes(len(data) - 40)):
+        path.write_bytes(damaged)
+        with pytest.raises(FileFormatError, match="HEIC"):
+            eg.load_image(path)
+
+
+def test_what_reads_photographs_of_telephones_is_named(tmp_path, monkeypatch) -> None:
+    path = tmp_path / "a.heic"
+    path.write_bytes((24).to_bytes(4) + b"ftypheic" + bytes(4) + b"mif1heic" + bytes(100))
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(MissingPackageError, match=r"epigauge\[heic\]"):
+        eg.load_image(path)

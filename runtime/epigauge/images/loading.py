@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import io
 import os
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,9 @@ _BLACK, _WHITE = 0.1, 99.9
 #: Values that these percentiles are taken of, about.
 _SAMPLE = 1_000_000
 
+#: Brands of still images that H.265 codes.
+_HEIC = frozenset((b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx"))
+
 _NEEDED = "(height, width), grey, or (height, width, 3 or 4), RGB or RGBA, of real numbers"
 
 
@@ -35,7 +39,8 @@ def load_image(path: PathLike) -> Image:
     """Read a photograph.
 
     Everything that OpenCV decodes is read: JPEG, PNG, TIFF, WebP, BMP, PGM and more, grey or in
-    colour, with 8 or 16 bits or floating point.
+    colour, with 8 or 16 bits or floating point. HEIC, as telephones write it, by pillow-heif (extra
+    `heic`).
 
     Parameters
     ----------
@@ -56,7 +61,7 @@ def load_image(path: PathLike) -> Image:
     OSError
         If the file cannot be read.
     MissingPackageError
-        If OpenCV is not installed.
+        If OpenCV is not installed, or pillow-heif for a HEIC file.
 
     Notes
     -----
@@ -78,6 +83,8 @@ def load_image(path: PathLike) -> Image:
         raise FileFormatError(path, "is larger than 1 GiB")
     if _is_cut_off(data):
         raise FileFormatError(path, "is a JPEG file that was cut off")
+    if _is_heic(data):
+        return _from_heic(Path(path), data)
     width, height = _claimed_size(data)
     if width * height > _MAX_PIXELS:
         raise FileFormatError(path, f"has {width} x {height} pixels, more than 2^28")
@@ -170,6 +177,31 @@ def opencv() -> Any:
 def _is_cut_off(data: bytes) -> bool:
     """Recognise a JPEG file whose last scan has no end; some OpenCV fill the rest with grey."""
     return data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[max(data.rfind(b"\xff\xda"), 0) :]
+
+
+def _is_heic(data: bytes) -> bool:
+    """Tell by the brands of the first box, whose last ones are those it is compatible with."""
+    end = int.from_bytes(data[:4])
+    brands = {data[k : k + 4] for k in range(8, min(end, 256), 4)}
+    return data[4:8] == b"ftyp" and bool(brands & _HEIC)
+
+
+def _from_heic(path: Path, data: bytes) -> Image:
+    """Decode a HEIC file; its own turns and mirrorings are applied, those of EXIF repeat them."""
+    try:
+        heif = importlib.import_module("pillow_heif")
+    except ImportError:
+        raise MissingPackageError("pillow-heif", "heic") from None
+    # The decoder raises ValueError, RuntimeError, EOFError, SyntaxError and others of its own.
+    try:
+        file = heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=True)
+        width, height = file.size
+        values = np.asarray(file) if width * height <= _MAX_PIXELS else None
+    except Exception as error:
+        raise FileFormatError(path, f"is a damaged HEIC file ({cut(error)})") from None
+    if values is None:
+        raise FileFormatError(path, f"has {width} x {height} pixels, more than 2^28")
+    return as_image("path", values)
 
 
 def _claimed_size(data: bytes) -> tuple[int, int]:
