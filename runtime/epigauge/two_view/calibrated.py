@@ -59,8 +59,8 @@ def estimate_essential(
     >>> import epigauge as eg
     >>> scene = eg.two_view_scene(n_points=200, noise_px=0.2, seed=1)
     >>> result = eg.estimate_essential(scene.x1, scene.x2, scene.K)
-    >>> result.in_front == np.count_nonzero(result.inlier), round(float(np.linalg.norm(result.t)))
-    (True, 1)
+    >>> bool(result.in_front == np.count_nonzero(result.inlier)), result.t.shape
+    (True, (3,))
     """
     return estimate_fundamental(
         x1,
