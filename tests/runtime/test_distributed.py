@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
-import threading
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import epigauge as eg
@@ -153,17 +154,20 @@ def test_a_worker_that_dies_costs_a_step(when: str, monkeypatch: pytest.MonkeyPa
         with cluster(2) as workers, distributed.Client(workers) as client:
             expected = eg.distributed.bundle_adjust(tracks, client, start)
             victim = next(iter(client.run(os.getpid).values()))
-            calls, submitted = [], dispatch.Dispatch.submitted
+            calls, killed, submitted = [], [], dispatch.Dispatch.submitted
 
             def killing(self: Any, address: str, name: str, *rest: Any) -> Any:
                 calls.append(name)
                 future = submitted(self, address, name, *rest)
-                if name == when and calls.count(name) == 3:
-                    threading.Timer(0.002, os.kill, (victim, signal.SIGKILL)).start()
+                # The second time that this part of a step is made by both workers.
+                if calls.count(when) >= 3 and not killed:
+                    killed.append(victim)
+                    os.kill(victim, signal.SIGKILL)
                 return future
 
             monkeypatch.setattr(dispatch.Dispatch, "submitted", killing)
             found = eg.distributed.bundle_adjust(tracks, client, start)
+            assert killed
             assert victim not in client.run(os.getpid).values()
     assert found.nit == expected.nit
     np.testing.assert_array_equal(found.fun, expected.fun)
@@ -188,6 +192,22 @@ def test_a_closed_client_is_named(client: Any) -> None:
     other.close()
     with pytest.raises(eg.ArgumentError, match="not connected"):
         eg.distributed.bundle_adjust(tracks, other, start)
+
+
+@pytest.mark.slow
+def test_the_command_line_adjusts_by_a_scheduler(client: Any, tmp_path: Path, run: Any) -> None:
+    path = tmp_path / "scene.npz"
+    eg.save_scene(path, *metric())
+    _, out, _ = run("bundle", path, "--json")
+    here = json.loads(out)
+    code, out, _ = run("bundle", path, "--json", "--scheduler", client.scheduler.address)
+    there = json.loads(out)
+    assert code == 0
+    assert there["cost"] == pytest.approx(here["cost"], rel=1e-12)
+    assert (there["flags"], there["rank"]) == (here["flags"], here["rank"])
+    code, _, told = run("bundle", path, "--scheduler", "nonsense://place")
+    assert code == 2
+    assert "--scheduler" in told
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 8, 13])

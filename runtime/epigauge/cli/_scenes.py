@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -148,11 +148,13 @@ class SceneJob:
             self._check_target(path)
         if precision is not None:
             check_target(precision, ".png", ".svg")
+        options = dict(options)
+        adjust: Callable[..., eg.BundleResult] = options.pop("adjust")
         out = console()
         begin = time.perf_counter()
         with watching(out, len(self.tracks), "adjustment", not json) as watch:
             watch.begin()
-            result = eg.bundle_adjust(
+            result = adjust(
                 self.tracks,
                 self.start,
                 refine=self.refine,

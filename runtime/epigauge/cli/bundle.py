@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -50,7 +50,7 @@ from epigauge.cli._scenes import (
     save_cloud,
 )
 from epigauge.cli._tables import save_residuals
-from epigauge.errors import ArgumentError, FileFormatError
+from epigauge.errors import ArgumentError, FileFormatError, MissingPackageError
 from epigauge.io import (
     TrackFile,
     load_reconstruction,
@@ -67,6 +67,9 @@ from epigauge.verdicts import explained, usable
 
 #: Tracks in these files have y down, those of BAL problems y up.
 _Y_DOWN = (".npz", ".csv")
+
+#: Seconds within which a scheduler answers.
+_ANSWERS = 10
 
 Clean = Annotated[bool, typer.Option("--clean", help="Use only what the file marks as clean.")]
 MaxIter = Annotated[int, typer.Option(help="Trial steps allowed.")]
@@ -150,6 +153,14 @@ def bundle(
     fix_view: FixView = None,
     rigs: Rigs = "keep",
     image_size: ImageSize = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Adjust by the workers of a Dask cluster, such as tcp://host:8786.",
+            show_default=False,
+        ),
+    ] = None,
     json: Json = False,
 ) -> int:
     """Adjust the cameras and points of a file of tracks, or of a scene.
@@ -183,6 +194,7 @@ def bundle(
         }
         asked |= {"backend": backend, "gauge_mode": gauge_mode, "robust": robust}
         refuse_options(others)
+        asked["adjust"] = adjuster(scheduler)
         scene = SceneJob(tracks, refine, fix_view or [], rigs, y_up, image_size)
         return scene.run(asked, plots, outputs, json, precision)
     if precision is not None:
@@ -198,7 +210,7 @@ def bundle(
     with watching(out, len(file.tracks), "first reconstruction", not json) as watch:
         first = first_reconstruction(file, tracks, start, backend, init, robust)
         watch.begin()
-        result = eg.bundle_adjust(
+        result = adjuster(scheduler)(
             file.tracks,
             first,
             method=method,
@@ -233,6 +245,28 @@ def bundle(
     if refused is not None:
         raise refused
     return DONE if result.success else NOT_CONVERGED
+
+
+def adjuster(scheduler: str | None) -> Callable[..., eg.BundleResult]:
+    """Return what adjusts: here, or the workers of the Dask scheduler at an address."""
+    if scheduler is None:
+        return eg.bundle_adjust
+    try:
+        from distributed import Client
+    except ImportError:
+        raise MissingPackageError("distributed", "dask") from None
+    try:
+        client = Client(scheduler, timeout=_ANSWERS, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        was = f"{scheduler!r:.80} does not answer ({error!s:.200})"
+        needed = "the address of a running scheduler, such as tcp://host:8786"
+        raise ArgumentError("--scheduler", was, needed) from None
+
+    def adjust(tracks: eg.Tracks, start: Any, **options: Any) -> eg.BundleResult:
+        with client:
+            return eg.distributed.bundle_adjust(tracks, client, start, **options)
+
+    return adjust
 
 
 def first_reconstruction(
