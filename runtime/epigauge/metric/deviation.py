@@ -30,7 +30,7 @@ def focal_lengths_of(found: MetricReconstruction) -> Array:
     return np.asarray(found.cameras.params[:, places].mean(axis=1))
 
 
-def known_to(known: MetricCovariance, unit: float) -> tuple[Array, bool]:
+def known_to(known: MetricCovariance, unit: float) -> tuple[Array, float, bool]:
     """Return the standard deviation of each focal length, and whether the model is in error.
 
     Parameters
@@ -45,8 +45,10 @@ def known_to(known: MetricCovariance, unit: float) -> tuple[Array, bool]:
     std : ndarray, shape (c,)
         To first order, widened where the views contradict one another, and by what a model with one
         focal length for both axes leaves open.
+    factor : float
+        By how much it was widened for the views.
     erroneous : bool
-        Whether they clearly do.
+        Whether they clearly contradict one another.
     """
     cameras = known.reconstruction.cameras
     model = camera_model(cameras.model)
@@ -54,14 +56,15 @@ def known_to(known: MetricCovariance, unit: float) -> tuple[Array, bool]:
     wanted[list(model.focal)] = 1.0 / len(model.focal)
     blocks = [known.intrinsics(c) for c in range(len(cameras))]
     std = np.sqrt([max(float(wanted @ block @ wanted), 0.0) for block in blocks])
-    erroneous = False
+    factor, erroneous = 1.0, False
     if known.noise_px > _EXACT * unit:
         scatter = scatter_of(known, wanted)
-        std = scatter.factor * std
+        factor = scatter.factor
         erroneous = scatter.ratio > _CLEARLY * scatter.limit
+    std = factor * std
     if len(model.focal) == 1:
         std = np.hypot(std, _ONE_FOR_BOTH * focal_lengths_of(known.reconstruction))
-    return std, erroneous
+    return std, factor, erroneous
 
 
 def turn_std(known: MetricCovariance) -> float:

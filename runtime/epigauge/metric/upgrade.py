@@ -261,11 +261,11 @@ def _judged(
     found = metric_of(bundle)
     focal, known = focal_lengths_of(found), None
     weights = np.where(bundle.rejected, 0.0, tracks.weights)
-    flags, turned = set(bundle.flags), 0.0
+    flags, turned, factor = set(bundle.flags), 0.0, 1.0
     std = np.full(len(focal), np.inf)
     try:
         known = covariance(tracks.weighted(weights), found, refine=fit.refined, backend=backend)
-        std, erroneous = known_to(known, float(np.median(images.unit)))
+        std, factor, erroneous = known_to(known, float(np.median(images.unit)))
         if erroneous:
             flags.add("model error")
     except ArgumentError:
@@ -274,7 +274,9 @@ def _judged(
         share = np.nan_to_num(std / focal, nan=np.inf)
     if (share > WEAK).any():
         flags.add("weak focal length")
-        turned = 0.0 if known is None else turn_std(known)
+    # A turn that noise may have made is none; what a lens does beside tells nothing of the motion.
+    if known is not None and (share > WEAK * factor).any():
+        turned = turn_std(known)
     flags |= set(motion_flags(found, images, turned))
     if (share > OPEN).any():
         flags.add("undetermined")
