@@ -274,11 +274,11 @@ def _judged(
         share = np.nan_to_num(std / focal, nan=np.inf)
     if (share > WEAK).any():
         flags.add("weak focal length")
-    # A turn that noise may have made is none; what a lens does beside tells nothing of the motion.
+    # By the noise alone: what a lens does beside tells nothing of the motion.
     if known is not None and (share > WEAK * factor).any():
         turned = turn_std(known)
     flags |= set(motion_flags(found, images, turned))
-    if (share > OPEN).any():
+    if (share > OPEN * factor).any():
         flags.add("undetermined")
     of_sample = np.isin(tracks.point, search.sample.points)
     if search.misfit(fit, median(np.linalg.norm(bundle.fun[of_sample], axis=1))):
