@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import epigauge as eg
 import numpy as np
 import pytest
@@ -74,14 +76,14 @@ class TestRefinement:
         result = eg.refine_homography(x1, x2)
 
         def squared(p: Array) -> Array:
-            return np.sum((x1 - p) ** 2 + (x2 - mapped(result.H, p)) ** 2, axis=1)
+            return np.asarray(np.sum((x1 - p) ** 2 + (x2 - mapped(result.H, p)) ** 2, axis=1))
 
         np.testing.assert_allclose(squared(result.points1), result.fun**2, rtol=1e-9)
         for move in ([0.05, 0.0], [-0.05, 0.0], [0.0, 0.05], [0.0, -0.05]):
             assert (squared(result.points1 + move) > result.fun**2).all()
 
     @pytest.mark.parametrize("seed", range(3))
-    def test_random_starts_find_nothing_lower(self, seed) -> None:
+    def test_random_starts_find_nothing_lower(self, seed: int) -> None:
         x1, x2, H = plane(seed, m=12)
         rng = np.random.default_rng(seed)
         cost = eg.refine_homography(x1, x2).cost
@@ -119,13 +121,13 @@ class TestRefinement:
 
     def test_backends_agree(self) -> None:
         x1, x2, _ = plane(8)
-        names = [name for name, reason in kernels.available().items() if reason is None]
-        found = [eg.refine_homography(x1, x2, backend=name) for name in names]  # type: ignore[arg-type]
+        names: list[Any] = [name for name, reason in kernels.available().items() if reason is None]
+        found = [eg.refine_homography(x1, x2, backend=name) for name in names]
         for other in found[1:]:
             assert apart(found[0].H, other.H) < 1e-9
 
     @pytest.mark.parametrize("loss", ["huber", "soft_l1", "cauchy", "truncated"])
-    def test_robust_losses_bear_wrong_matches(self, loss) -> None:
+    def test_robust_losses_bear_wrong_matches(self, loss: Any) -> None:
         x1, x2, H = plane(9)
         x2[:9] += 100.0
         result = eg.refine_homography(x1, x2, loss=loss)
@@ -147,19 +149,24 @@ class TestRefinement:
 
 class TestRawMatches:
     @pytest.mark.parametrize(("m", "wrong"), [(20, 0.3), (200, 0.6), (1000, 0.8)])
-    def test_wrong_matches_are_found(self, m, wrong) -> None:
+    def test_wrong_matches_are_found(self, m: int, wrong: float) -> None:
         x1, x2, H = plane(11, m, 0.5)
         rng = np.random.default_rng(1)
         count = round(wrong * m)
         x2[:count] = rng.uniform(0.0, 1000.0, (count, 2))
-        found, inlier = eg.estimate_homography(x1, x2)
+        result = eg.estimate_homography(x1, x2)
+        found, inlier = result.H, result.inlier
+        assert [np.array_equal(a, b) for a, b in zip(result, (found, inlier), strict=True)] == [
+            True,
+            True,
+        ]
         off = np.linalg.norm(mapped(found, x1[count:]) - mapped(H, x1[count:]), axis=1)
         assert np.median(off) < 1.0
         assert np.mean(inlier[:count]) < 0.02
         assert np.mean(inlier[count:]) > 0.9
 
     @pytest.mark.parametrize("m", [20, 200])
-    def test_random_matches_have_nothing_in_common(self, m) -> None:
+    def test_random_matches_have_nothing_in_common(self, m: int) -> None:
         rng = np.random.default_rng(m)
         x1, x2 = rng.uniform(0.0, 1000.0, (2, m, 2))
         result = eg.estimate_homography(x1, x2)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import epigauge as eg
 import numpy as np
 import pytest
@@ -33,7 +35,7 @@ def scene(kind: str, m: int, wrong: float, seed: int) -> tuple[Array, Array, Arr
 
 @pytest.mark.parametrize("kind", ["nothing", "still", "rotation", "plane", "F"])
 @pytest.mark.parametrize("wrong", [0.0, 0.3])
-def test_the_model_is_named(kind, wrong) -> None:
+def test_the_model_is_named(kind: str, wrong: float) -> None:
     x1, x2, _ = scene(kind, 100, wrong, 5)
     result = eg.estimate_two_view(x1, x2)
     assert result.model == kind
@@ -50,15 +52,17 @@ def test_calibrated_cameras_give_the_motion() -> None:
     x1, x2, R = scene("F", 150, 0.3, 6)
     result = eg.estimate_two_view(x1, x2, K)
     assert result.model == "E"
+    assert result.R is not None
     assert np.abs(result.R - R).max() < 0.01
     x1, x2, R = scene("rotation", 150, 0.3, 7)
     result = eg.estimate_two_view(x1, x2, K)
     assert result.model == "rotation"
+    assert result.R is not None
     assert np.abs(result.R - R).max() < 0.005
     assert result.t is None
 
 
-def test_a_result_is_plain_data_and_text(tmp_path) -> None:
+def test_a_result_is_plain_data_and_text(tmp_path: Path) -> None:
     x1, x2, _ = scene("plane", 60, 0.0, 8)
     result = eg.estimate_two_view(x1, x2)
     assert "plane" in str(result)

@@ -276,7 +276,7 @@ def _searched(
         near = np.count_nonzero(_squares(table, best, q1, q2) <= (3.0 * SCALES[0]) ** 2)
         needed = min(max(_PATIENCE * (m / max(near, 4.0)) ** 4, _LEAST), _MOST)
         highest = max(highest, fitted)
-    return best
+    return np.asarray(best)
 
 
 def _improved(table: Table, H: Array, q1: Array, q2: Array, before: Array) -> tuple[Array, float]:
@@ -289,7 +289,7 @@ def _improved(table: Table, H: Array, q1: Array, q2: Array, before: Array) -> tu
         H = fit_homography(q1, q2, weights, table)[0]
         found.append(H)
     scores = [_agreement(_squares(table, one, q1, q2)) for one in found]
-    return found[int(np.argmax(scores))], max(scores)
+    return np.asarray(found[int(np.argmax(scores))]), max(scores)
 
 
 def chance_on_plane(table: Table, H: Array, q1: Array, q2: Array, limit: float) -> float:
