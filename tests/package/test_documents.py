@@ -29,6 +29,7 @@ MODULES = {
                 "casadi",
                 "colmap",
                 "datasets",
+                "distributed",
                 "errors",
                 "images",
                 "interop",
