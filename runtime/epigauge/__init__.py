@@ -48,6 +48,7 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
         save_tracks,
     )
     from epigauge.kernels import backend, set_backend
+    from epigauge.line_scenes import LineScene, line_scene
     from epigauge.metric.pair import FocalLengths, focal_lengths
     from epigauge.metric.upgrade import MetricUpgrade, metric_upgrade
     from epigauge.multi_view import gauge
@@ -55,6 +56,8 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge.multi_view.affine_start import initialize_affine
     from epigauge.multi_view.compare import Comparison, compare
     from epigauge.multi_view.initialize import initialize
+    from epigauge.multi_view.line_adjust import triangulate_lines
+    from epigauge.multi_view.line_tracks import LineTracks
     from epigauge.multi_view.reconstruction import Reconstruction
     from epigauge.multi_view.tracks import Tracks
     from epigauge.multi_view.uncertainty import ReconstructionCovariance, covariance
@@ -99,6 +102,8 @@ __all__ = [
     "HomographyResult",
     "ImageMatches",
     "IntrinsicPrior",
+    "LineScene",
+    "LineTracks",
     "Matches",
     "MetricCovariance",
     "MetricReconstruction",
@@ -139,6 +144,7 @@ __all__ = [
     "initialize_affine",
     "interop",
     "kernels",
+    "line_scene",
     "load_image",
     "load_matches",
     "load_reconstruction",
@@ -162,6 +168,7 @@ __all__ = [
     "save_tracks",
     "set_backend",
     "triangulate",
+    "triangulate_lines",
     "two_view_scene",
     "verdicts",
 ]
@@ -179,12 +186,15 @@ _WHERE = {
         "save_matches save_reconstruction save_result save_scene save_tracks"
     ),
     "kernels": "backend set_backend",
+    "line_scenes": "LineScene line_scene",
     "metric.pair": "FocalLengths focal_lengths",
     "metric.upgrade": "MetricUpgrade metric_upgrade",
     "multi_view.adjust": "BundleResult bundle_adjust",
     "multi_view.affine_start": "initialize_affine",
     "multi_view.compare": "Comparison compare",
     "multi_view.initialize": "initialize",
+    "multi_view.line_adjust": "triangulate_lines",
+    "multi_view.line_tracks": "LineTracks",
     "multi_view.reconstruction": "Reconstruction",
     "multi_view.tracks": "Tracks",
     "multi_view.uncertainty": "ReconstructionCovariance covariance",

@@ -139,6 +139,11 @@ FLAGS = {
         "the noise leaves the depth of many points open: they may as well be infinitely far",
         "use their directions, not their places; or take images farther apart",
     ),
+    "open lines": Flag(
+        "the views leave some lines open: a line in one plane with all centres that see it "
+        "(epipolar plane), or one very far away",
+        "leave such lines out, or take images from beside that plane",
+    ),
     "gross errors": Flag(
         "a few matches carry most of the error: wrong ones among them, which least squares bends "
         "the result to",

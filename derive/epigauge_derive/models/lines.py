@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import sympy as sp
 
-from epigauge_derive.camera_model import H, POSE, CameraModel, camera_models
+from epigauge_derive.camera_model import POSE, CameraModel, H, camera_models
 from epigauge_derive.gauge import gauge
 from epigauge_derive.kernel import Input, Kernel, Let, Output, at, cross, jacobian
 from epigauge_derive.models.rotations import euler_rotation

@@ -176,7 +176,7 @@ class NumpyLinearizer:
                 moving = -np.sum(g * step, axis=1) > how.tolerance * cost
                 if not moving.any():
                     break
-                trial = points + step
+                trial = self.moved(cameras, points, step)
                 r_trial, _, J_trial = self.observe(cameras, trial)
                 cost_trial, weight_trial = self._costs(r_trial)
                 better = moving & (cost_trial < cost)
@@ -187,6 +187,10 @@ class NumpyLinearizer:
                 cost = np.where(better, cost_trial, cost)
                 lam = np.where(better, lam / how.factor, lam * how.factor)
         return points, cost
+
+    def moved(self, cameras: Array, points: Array, step: Array) -> Array:
+        """Return the points after a step of their own tangents."""
+        return np.asarray(points + step)
 
     def inverse_roots(self, V: Array, D: Array, lam: float, g: Array) -> tuple[Array, Array]:
         """Return T with T T^T = (V + lam D)^-1 for blocks (m, b, b), and T^T g."""

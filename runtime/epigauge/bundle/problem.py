@@ -159,7 +159,7 @@ class BundleProblem:
         """Return the estimate that a step leads to, its points re-triangulated where asked for."""
         cameras = self.retraction(state.cameras, step.cameras)
         cameras = self.freedom.retracted(state.cameras, cameras, step.cameras)
-        points, steps = state.points + step.points, state.estimate.steps + 1
+        points, steps = self.moved(state, step.points), state.estimate.steps + 1
         cameras, points = self.freedom.settled(cameras, points, steps)
         if self.model.homogeneous:
             cameras, points = in_range(cameras), in_range(points)
@@ -167,6 +167,10 @@ class BundleProblem:
             return Estimate(cameras, points, steps)
         refined, costs = self.refined(cameras, points)
         return Estimate(cameras, refined, steps, costs)
+
+    def moved(self, state: BundleState, step: Array) -> Array:
+        """Return the points after a step."""
+        return np.asarray(state.points + step)
 
     def refined(self, cameras: Array, points: Array) -> tuple[Array, Array]:
         """Return points after iterations of their own, and their costs."""

@@ -40,18 +40,22 @@ class MetricReconstruction(ReconstructionBase):
         Points.
     cameras : Cameras
         Their model and parameters.
+    lines : array_like, shape (L, 6), optional
+        Lines as Pluecker coordinates (n, v), v the direction and n = X x v for every point X of the
+        line; they are stored with a unit vector v.
 
     Raises
     ------
     ArgumentError
-        On other shapes, numbers that are not finite, matrices R that are no rotations (the message
-        says how to repair them), and cameras that have no rotation.
+        On other shapes, numbers that are not finite, lines at infinity, matrices R that are no
+        rotations (the message says how to repair them), and cameras that have no rotation.
     """
 
     R: Array
     t: Array
     X: Array
     cameras: Cameras
+    lines: Array | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.cameras, Cameras):
@@ -72,6 +76,8 @@ class MetricReconstruction(ReconstructionBase):
         _check_rotations(R)
         for name, array in (("R", R), ("t", t), ("X", X)):
             object.__setattr__(self, name, frozen(array))
+        if self.lines is not None:
+            object.__setattr__(self, "lines", frozen(_checked_lines(self.lines)))
 
     @property
     def n_views(self) -> int:
@@ -217,11 +223,28 @@ class MetricReconstruction(ReconstructionBase):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the arguments: arrays from a pickle could be written to."""
-        return type(self), (self.R, self.t, self.X, self.cameras)
+        return type(self), (self.R, self.t, self.X, self.cameras, self.lines)
 
     def __repr__(self) -> str:
         views, points = counted(self.n_views, "view"), counted(self.n_points, "point")
         return f"MetricReconstruction({views}, {points}, {self.cameras!r})"
+
+
+def _checked_lines(lines: Any) -> Array:
+    """Return lines with unit directions."""
+    rows = finite_rows("lines", lines, (6,), "Pluecker coordinates (n, v) of one line a row")
+    n, v = rows[:, :3], rows[:, 3:]
+    length = np.linalg.norm(v, axis=1)
+    bad = np.flatnonzero(length <= 1e-12 * np.linalg.norm(n, axis=1))
+    if len(bad):
+        raise ArgumentError("lines", f"is at infinity in row {bad[0]}", "finite lines, v not zero")
+    sizes = np.maximum(length * np.linalg.norm(n, axis=1), 1e-300)
+    bad = np.flatnonzero(np.abs(np.sum(n * v, axis=1)) > ORTHONORMAL * sizes)
+    if len(bad):
+        was = f"is no line in row {bad[0]}: n and v are not orthogonal"
+        raise ArgumentError("lines", was, "n = X x v of a point X and a direction v")
+    scaled = np.abs(length - 1.0) > 1e-12
+    return np.where(scaled[:, None], rows / length[:, None], rows)
 
 
 def _check_rotations(R: Array) -> None:

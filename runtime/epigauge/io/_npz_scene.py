@@ -28,7 +28,7 @@ _TRACKS = ("view", "point", "xy")
 _NEEDED = (*_TRACKS, "R", "t", "X", "model", "params", "camera_of_view")
 #: The same of cameras without rotations: affine and projective ones.
 _AFFINE, _PROJECTIVE = (*_TRACKS, "P", "X"), (*_TRACKS, "P", "Q")
-_LABELS = (*MEASURED, "weights", "names", "sizes", "colours", "notes", "rotations")
+_LABELS = (*MEASURED, "weights", "names", "sizes", "colours", "notes", "rotations", "lines")
 _IDS = ("image_ids", "camera_ids", "point_ids", "feature_of")
 _COLMAP = (*(f"colmap_{name}" for name in _IDS), "colmap_features", "colmap_feature_counts")
 _TEXTS = ("colmap_cameras", "colmap_rigs", "colmap_frames")
@@ -64,9 +64,10 @@ def write_npz_scene(
     """
     arrays = arrays_of(tracks)
     match reconstruction:
-        case MetricReconstruction(R=R, t=t, X=X, cameras=cameras):
+        case MetricReconstruction(R=R, t=t, X=X, cameras=cameras, lines=lines):
             arrays |= {"R": R, "t": t, "X": X, "model": _bytes([cameras.model])}
             arrays |= {"params": cameras.params, "camera_of_view": cameras.camera_of_view}
+            arrays |= {} if lines is None else {"lines": lines}
         case AffineReconstruction(P=P, X=X):
             arrays |= {"P": P, "X": X}
         case Reconstruction(P=P, Q=Q):
@@ -140,6 +141,7 @@ def read_npz_scene(path: Path) -> RawScene:
         ("sizes", "iu", (n, 2)),
         ("colours", "iu", (m, 3)),
         ("rotations", "f", (n, None)),
+        ("lines", "f", (None, 6)),
         ("colmap_image_ids", "iu", (n,)),
         ("colmap_camera_ids", "iu", (c,)),
         ("colmap_point_ids", "iu", (m,)),
@@ -184,6 +186,7 @@ def read_npz_scene(path: Path) -> RawScene:
         found.get("colours"),
         source,
         {name: found[name] for name in ("view", *MEASURED) if name in found},
+        found.get("lines"),
     )
 
 

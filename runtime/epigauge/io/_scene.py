@@ -102,6 +102,7 @@ class RawScene:
     colours: NDArray[Any] | None = None
     source: SceneSource = field(default_factory=SceneSource)
     measured: dict[str, Any] = field(default_factory=dict)
+    lines: Array | None = None
 
 
 def finished(
@@ -172,7 +173,9 @@ def finished(
             reconstruction = Reconstruction(raw.R[views], raw.X[points])
         else:
             made = Cameras(raw.model, raw.params[cameras], new_camera)
-            reconstruction = MetricReconstruction(raw.R[views], raw.t[views], raw.X[points], made)
+            reconstruction = MetricReconstruction(
+                raw.R[views], raw.t[views], raw.X[points], made, raw.lines
+            )
     except ArgumentError as error:
         raise FileFormatError(path, str(error)) from None
     source = replace(raw.source, notes=tuple(dict.fromkeys(notes)))

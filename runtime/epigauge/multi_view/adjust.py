@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
@@ -25,6 +26,8 @@ from epigauge.errors import ArgumentError
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import Gauge
 from epigauge.multi_view.initialize import initialize
+from epigauge.multi_view.line_adjust import adjusted_lines
+from epigauge.multi_view.line_tracks import LineTracks
 from epigauge.multi_view.measured import whitened
 from epigauge.multi_view.prior_noise import with_estimated_noise
 from epigauge.multi_view.reconstruction import Reconstruction
@@ -52,6 +55,7 @@ def bundle_adjust(
     tracks: Tracks,
     start: AnyReconstruction | None = None,
     *,
+    lines: LineTracks | None = None,
     refine: str | Sequence[str] = "all",
     fixed_views: Iterable[int] = (),
     fixed_points: Iterable[int] = (),
@@ -86,6 +90,12 @@ def bundle_adjust(
         Observations.
     start : Reconstruction, MetricReconstruction or AffineReconstruction, optional
         Where to begin, in any basis; by default `initialize(tracks)`.
+    lines : LineTracks, optional
+        Segments of lines, adjusted together with the points: the distances of their end points from
+        the images of the lines. For metric starts with one of the methods "covariant",
+        "levenberg" and "marquardt", without gauge, priors and `robust`. The lines begin at those of
+        the start, or triangulated. Cameras with distortion see end points that are undistorted
+        once, with their covariances to first order: then ``refine="pose"``.
     refine : "all", "pose" or sequence of str
         Intrinsics of a metric start to be refined beside rotations, positions and points: all of
         them, none, or those named, such as ``("f", "k1")``. "f" of a model with fx and fy changes
@@ -183,6 +193,9 @@ def bundle_adjust(
         raise ArgumentError("noise_px", "is given without priors", "priors, or the default")
     noise_px = tracks.unit if noise_px == "tracks" else noise_px
     noise_px = noise_px if noise_px is None else as_positive("noise_px", noise_px)
+    if lines is not None and (robust or noise_px is None):
+        name = "robust" if robust else "noise_px"
+        raise ArgumentError(name, "is given with lines", "the default, and a robust loss")
     if robust or noise_px is None:
         options: dict[str, Any] = {
             "refine": refine,
@@ -227,6 +240,33 @@ def bundle_adjust(
     if not hasattr(workers, "linearizer"):  # what epigauge.distributed passes
         workers = threads = as_count("workers", workers)
     stopping = lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter)
+    if lines is not None:
+        without = {"priors": priors, "gauge": gauge}
+        for name, value in without.items():
+            if value is not None:
+                raise ArgumentError(name, "is given with lines", "none, or no lines")
+        adjusted = adjusted_lines(
+            tracks,
+            start,
+            lines,
+            method=method,
+            damping=damping,
+            schedule=_SCHEDULES["adaptive" if schedule == "auto" else schedule],
+            loss=loss,
+            loss_scale_px=loss_scale_px,
+            stopping=stopping,
+            backend=backend,
+            callback=callback,
+            refine=refine,
+            fixed_views=fixed_views,
+            fixed_points=fixed_points,
+            embedded=embedded,
+        )
+        verdict = Verdict(adjusted.flags, adjusted.rank, adjusted.n_behind, adjusted.condition)
+        none = np.zeros(len(tracks), dtype=np.bool_)
+        found = adjusted.outcome, 1.0, verdict, none, method, adjusted.loss_scale_px, noise_px
+        whole = _result(tracks, adjusted.reconstruction, adjusted.fun, *found)
+        return replace(whole, line_fun=adjusted.line_fun)
     table = kernels.table(backend)
     start = initialize(tracks, backend=backend) if start is None else start
     job = job_of(

@@ -70,6 +70,10 @@ class BundleResult(Result):
         Where nothing determines a direction, what moves most along it.
     nfev, njev, nit, status, message, success, history
         As in `FundamentalResult`.
+    line_fun : ndarray, shape (K, 2), or None
+        With lines: signed distances of both end points of each segment from the image of its line,
+        in the order of the `LineTracks`, in pixels; over their standard deviations and times
+        `Tracks.unit` where these were given.
 
     Notes
     -----
@@ -102,6 +106,7 @@ class BundleResult(Result):
     message: str
     success: bool
     history: tuple[lm.Row, ...] = field(repr=False)
+    line_fun: Array | None = field(default=None, repr=False)
 
     @classmethod
     def unjudged(cls, judge: Callable[[], Verdict], **known: Any) -> BundleResult:

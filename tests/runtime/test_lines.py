@@ -1,0 +1,241 @@
+"""Lines beside points: triangulation, adjustment, invariance, verdicts, bad input."""
+
+from __future__ import annotations
+
+import copy
+
+import epigauge as eg
+import numpy as np
+import pytest
+from epigauge import lm
+from epigauge.bundle.dampings import Covariant
+from epigauge.bundle.lines import moved_lines
+from epigauge.bundle.similarity import Similarity
+from epigauge.cameras import camera_model
+from epigauge.kernels import table
+from epigauge.multi_view.line_adjust import line_job
+
+
+def off(found, wanted):
+    """Return the distances of lines from others, their signs being free."""
+    sign = np.sign(np.sum(found[:, 3:] * wanted[:, 3:], axis=1))[:, None]
+    return np.linalg.norm(found * sign - wanted, axis=1)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return eg.line_scene(seed=3)
+
+
+@pytest.fixture(scope="module")
+def adjusted(scene):
+    return eg.bundle_adjust(
+        scene.tracks, scene.true, lines=scene.line_tracks, refine="pose", ftol=1e-14
+    )
+
+
+def test_exact_segments_give_the_lines():
+    scene = eg.line_scene(noise_px=0.0, n_lines=20)
+    found = eg.triangulate_lines(scene.line_tracks, scene.true)
+    assert off(found, scene.true.lines).max() < 1e-9
+
+
+def test_an_adjustment_is_determined_and_fits(scene, adjusted):
+    assert adjusted.success
+    assert not adjusted.flags
+    assert adjusted.rank == 6 * 8 + 3 * 60 + 4 * 60 - 7
+    redundancy = 2 * 480 + 2 * 480 - adjusted.rank
+    # Sum of squares over the redundancy: one, give or take sqrt(2 / redundancy).
+    assert abs(2 * adjusted.cost / redundancy - 1) < 4 * np.sqrt(2 / redundancy)
+    assert adjusted.line_fun.shape == (480, 2)
+    total = np.sum(adjusted.fun**2) + np.sum(adjusted.line_fun**2)
+    np.testing.assert_allclose(0.5 * total, adjusted.cost, rtol=1e-9)
+
+
+def test_lines_without_noise_lead_back_to_the_truth():
+    scene = eg.line_scene(noise_px=0.0, n_points=12, n_lines=20, seed=2)
+    random, true = np.random.default_rng(0), scene.true
+    moved = true.X + 0.05 * random.standard_normal(true.X.shape)
+    start = eg.MetricReconstruction(true.R, true.t + 0.02, moved, true.cameras)
+    found = eg.bundle_adjust(scene.tracks, start, lines=scene.line_tracks, max_iter=200)
+    assert found.rms_px < 1e-6
+    assert np.abs(found.line_fun).max() < 1e-5
+
+
+@pytest.mark.parametrize("backend", ["numpy", "c", "casadi"])
+def test_back_ends_end_at_one_minimum(scene, adjusted, backend):
+    if eg.kernels.available()[backend] is not None:
+        pytest.skip(str(eg.kernels.available()[backend]))
+    found = eg.bundle_adjust(
+        scene.tracks,
+        scene.true,
+        lines=scene.line_tracks,
+        refine="pose",
+        backend=backend,
+    )
+    np.testing.assert_allclose(found.cost, adjusted.cost, rtol=1e-7)
+
+
+def similarities(count):
+    random = np.random.default_rng(5)
+    for _ in range(count):
+        Q = np.linalg.qr(random.standard_normal((3, 3)))[0]
+        scale = float(np.exp(random.uniform(-3, 3)))
+        yield Similarity(scale, Q * np.linalg.det(Q), *random.standard_normal((2, 3)))
+
+
+def test_steps_are_the_same_in_twenty_frames():
+    scene = eg.line_scene(n_points=15, n_lines=15, n_views=5, seed=4)
+    start = scene.true
+    costs = []
+    for there in [None, *similarities(20)]:
+        if there is not None:
+            cameras, X = there.apply(scene.true.vectors, scene.true.X)
+            pose = cameras[:, :12].reshape(-1, 3, 4)
+            lines = moved_lines(there, scene.true.lines)
+            parts = scene.true.cameras, lines
+            start = eg.MetricReconstruction(pose[:, :, :3], pose[:, :, 3], X, *parts)
+        made, _ = line_job(scene.tracks, start, scene.line_tracks, table())
+        problem, begin = made.problem, made.start
+        if there is not None:  # in that very frame, not in the one that suits best
+            begin = copy.copy(begin)
+            rows = np.zeros_like(begin.points)
+            rows[:15, :3], rows[15:] = start.X, start.lines
+            object.__setattr__(begin, "cameras", start.vectors)
+            object.__setattr__(begin, "points", rows)
+        outcome = lm.minimize(
+            problem, begin, Covariant(), lm.Classic(), lm.Stopping(1e-14, 0.0, 0.0, 5)
+        )
+        costs.append([row.cost for row in outcome.history])
+    assert len(costs[0]) == 6
+    assert costs[0][1] < 0.999 * costs[0][0]
+    for other in costs[1:]:
+        np.testing.assert_allclose(other, costs[0], rtol=1e-7)
+
+
+def test_lines_improve_the_cameras():
+    errors = []
+    for seed in range(6):
+        scene = eg.line_scene(n_points=10, n_lines=60, seed=seed)
+        both = []
+        for lines in (None, scene.line_tracks):
+            found = eg.bundle_adjust(scene.tracks, scene.true, lines=lines, refine="pose")
+            R = found.reconstruction.R
+            relative = R[1:] @ np.swapaxes(R[:1], 1, 2)
+            wanted = scene.true.R[1:] @ np.swapaxes(scene.true.R[:1], 1, 2)
+            both.append(np.sqrt(np.mean((relative - wanted) ** 2)))
+        errors.append(both)
+    points, mixed = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert mixed < 0.7 * points
+
+
+def test_cameras_with_distortion_see_straightened_end_points():
+    scene = eg.line_scene(noise_px=0.0, n_lines=12, n_points=12)
+    model = eg.Cameras("RADIAL", [[1000.0, 0.0, 0.0, -0.15, 0.05]], np.zeros(8, np.intp))
+    parts = scene.true.R, scene.true.t, scene.true.X, model
+    true = eg.MetricReconstruction(*parts, scene.true.lines)
+    image = camera_model("RADIAL").kernel("image")
+    params = model.of_views[scene.line_tracks.view].T
+    ends = []
+    for k in (0, 2):
+        xy = scene.line_tracks.segments[:, k : k + 2].T / 1000.0
+        ends.append(image(np.concatenate([xy, np.ones((1, xy.shape[1]))]), params)[0])
+    bent = eg.LineTracks(
+        scene.line_tracks.view, scene.line_tracks.line, np.concatenate(ends).T, sigma=0.5
+    )
+    tracks = eg.Tracks(scene.tracks.view, scene.tracks.point, true.project(scene.tracks))
+    assert off(eg.triangulate_lines(bent, true), true.lines).max() < 1e-7
+    found = eg.bundle_adjust(tracks, true, lines=bent, refine="pose")
+    assert np.abs(found.line_fun).max() < 1e-6
+    with pytest.raises(eg.ArgumentError, match="RADIAL"):
+        eg.bundle_adjust(tracks, true, lines=bent)
+
+
+def test_a_line_in_an_epipolar_plane_is_refused():
+    scene = eg.line_scene(n_views=2, n_points=12, n_lines=3)
+    centres = scene.true.centres
+    v = centres[1] - centres[0]
+    v /= np.linalg.norm(v)
+    ends = []
+    for s in (-1.0, 1.0):
+        h = np.einsum("nij,j->ni", scene.true.R, s * v + 0.3) + scene.true.t
+        ends.append(1000.0 * h[:, :2] / h[:, 2:])
+    segments = np.concatenate([scene.line_tracks.segments, np.concatenate(ends, axis=1)])
+    line = np.concatenate([scene.line_tracks.line, [3, 3]])
+    view = np.concatenate([scene.line_tracks.view, [0, 1]])
+    with pytest.raises(eg.ArgumentError, match=r"1 lines .* 3; needed: .*epipolar plane"):
+        eg.triangulate_lines(eg.LineTracks(view, line, segments), scene.true)
+
+
+def test_wrong_segments_are_told(scene):
+    lines = scene.line_tracks
+    segments = lines.segments.copy()
+    random = np.random.default_rng(0)
+    segments[random.choice(len(segments), 5, replace=False)] += [200.0, 0.0, -150.0, 300.0]
+    wrong = eg.LineTracks(lines.view, lines.line, segments)
+    found = eg.bundle_adjust(scene.tracks, scene.true, lines=wrong, refine="pose")
+    assert {"gross errors", "outliers"} & set(found.flags)
+
+
+def test_fixed_views_and_points_stay(scene):
+    found = eg.bundle_adjust(
+        scene.tracks,
+        scene.true,
+        lines=scene.line_tracks,
+        refine="pose",
+        fixed_views=[0, 1],
+        fixed_points=[2],
+    )
+    assert found.success
+    assert (found.reconstruction.R[:2] == scene.true.R[:2]).all()
+    assert (found.reconstruction.X[2] == scene.true.X[2]).all()
+
+
+@pytest.mark.parametrize(
+    ("view", "line", "segments", "options", "message"),
+    [
+        ([0, 1, 0], [0, 0, 1], np.eye(3, 4) * 90, {}, "1 is seen by fewer than two views"),
+        ([0, 0], [0, 0], np.eye(2, 4) * 90, {}, "twice"),
+        ([0, 1], [0, 0], [[0, 0, 1, 1], [0, 0, 9, 9]], {}, "1.41 px long in row 0"),
+        ([0, 1], [0, 0], [[0, 0, np.nan, 1], [0, 0, 9, 9]], {}, "not finite in row 0"),
+        ([0, 1], [0, 0], np.ones((2, 3)), {}, r"\(2, 3\)"),
+        ([0, -1], [0, 0], np.eye(2, 4), {}, "-1"),
+        ([0, 1], [0, 0], np.eye(2, 4) * 90, {"sigma": 0.0}, "sigma"),
+        ([0, 1], [0, 0], np.eye(2, 4) * 90, {"covariance": np.zeros((2, 2, 2, 2))}, "row 0"),
+    ],
+)
+def test_bad_observations_are_refused(view, line, segments, options, message):
+    with pytest.raises(eg.ArgumentError, match=message):
+        eg.LineTracks(view, line, segments, **options)
+
+
+def test_what_lines_do_not_go_with_is_refused(scene):
+    lines = scene.line_tracks
+    for options, name in (
+        ({"robust": True}, "robust"),
+        ({"gauge": eg.gauge.identity()}, "gauge"),
+        ({"method": "free"}, "method"),
+        ({"noise_px": None, "priors": [eg.PositionPrior(0, [0, 0, 0], 1.0)]}, "noise_px"),
+    ):
+        with pytest.raises(eg.ArgumentError, match=name):
+            eg.bundle_adjust(scene.tracks, scene.true, lines=lines, **options)
+    with pytest.raises(eg.ArgumentError, match="MetricReconstruction"):
+        eg.bundle_adjust(scene.tracks, scene.true.to_projective(), lines=lines)
+    with pytest.raises(eg.ArgumentError, match="LineTracks"):
+        eg.bundle_adjust(scene.tracks, scene.true, lines=scene.tracks)
+    parts = scene.true.R, scene.true.t, scene.true.X, scene.true.cameras
+    for bad, message in (
+        (np.ones((1, 6)), "no line in row 0"),
+        ([[1, 0, 0, 0, 0, 0]], "infinity"),
+    ):
+        with pytest.raises(eg.ArgumentError, match=message):
+            eg.MetricReconstruction(*parts, bad)
+
+
+def test_scenes_keep_their_lines(tmp_path, scene):
+    path = tmp_path / "scene.npz"
+    eg.save_scene(path, scene.tracks, scene.true)
+    tracks, found = eg.load_scene(path)
+    assert (found.lines == scene.true.lines).all()
+    assert (copy.deepcopy(found).lines == found.lines).all()
+    assert len(tracks) == len(scene.tracks)
