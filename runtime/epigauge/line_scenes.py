@@ -121,5 +121,5 @@ def line_scene(
     tracks = Tracks(view, point, xy.reshape(-1, 2))
     line, view = np.divmod(np.arange(n_lines * n_views), n_views)
     line_tracks = LineTracks(view, line, segments.reshape(-1, 4))
-    cameras = Cameras("SIMPLE_PINHOLE", [[focal, 0.0, 0.0]], np.zeros(n_views, np.intp))
+    cameras = Cameras("SIMPLE_PINHOLE", np.array([[focal, 0.0, 0.0]]), np.zeros(n_views, np.intp))
     return LineScene(tracks, line_tracks, MetricReconstruction(R, t, X, cameras, lines))

@@ -245,7 +245,7 @@ def bundle_adjust(
         for name, value in without.items():
             if value is not None:
                 raise ArgumentError(name, "is given with lines", "none, or no lines")
-        adjusted = adjusted_lines(
+        mixed = adjusted_lines(
             tracks,
             start,
             lines,
@@ -262,11 +262,11 @@ def bundle_adjust(
             fixed_points=fixed_points,
             embedded=embedded,
         )
-        verdict = Verdict(adjusted.flags, adjusted.rank, adjusted.n_behind, adjusted.condition)
+        verdict = Verdict(mixed.flags, mixed.rank, mixed.n_behind, mixed.condition)
         none = np.zeros(len(tracks), dtype=np.bool_)
-        found = adjusted.outcome, 1.0, verdict, none, method, adjusted.loss_scale_px, noise_px
-        whole = _result(tracks, adjusted.reconstruction, adjusted.fun, *found)
-        return replace(whole, line_fun=adjusted.line_fun)
+        found = mixed.outcome, 1.0, verdict, none, method, mixed.loss_scale_px, noise_px
+        whole = _result(tracks, mixed.reconstruction, mixed.fun, *found)
+        return replace(whole, line_fun=mixed.line_fun)
     table = kernels.table(backend)
     start = initialize(tracks, backend=backend) if start is None else start
     job = job_of(
