@@ -7,7 +7,7 @@
 
 const char *eg_digest(void)
 {
-    return "b9ef590bed58b2a9";
+    return "84b0f4b7ef332c78";
 }
 
 const char *eg_sources(void)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
@@ -262,11 +261,25 @@ def bundle_adjust(
             fixed_points=fixed_points,
             embedded=embedded,
         )
+        outcome, counts = mixed.outcome, tracks.weights > 0.0
         verdict = Verdict(mixed.flags, mixed.rank, mixed.n_behind, mixed.condition)
-        none = np.zeros(len(tracks), dtype=np.bool_)
-        found = mixed.outcome, 1.0, verdict, none, method, mixed.loss_scale_px, noise_px
-        whole = _result(tracks, mixed.reconstruction, mixed.fun, *found)
-        return replace(whole, line_fun=mixed.line_fun)
+        return BundleResult.unjudged(
+            lambda: verdict,
+            reconstruction=mixed.reconstruction,
+            rms_px=float(np.sqrt(np.mean(mixed.fun[counts] ** 2))),
+            cost=outcome.state.cost,
+            fun=mixed.fun,
+            method=method,
+            loss_scale_px=mixed.loss_scale_px,
+            noise_px=noise_px,
+            rejected=np.zeros(len(tracks), dtype=np.bool_),
+            nfev=outcome.nfev,
+            njev=outcome.njev,
+            nit=outcome.nit,
+            status=outcome.status,
+            history=outcome.history,
+            line_fun=mixed.line_fun,
+        )
     table = kernels.table(backend)
     start = initialize(tracks, backend=backend) if start is None else start
     job = job_of(

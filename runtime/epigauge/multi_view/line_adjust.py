@@ -76,7 +76,7 @@ def segments_of(
     model = camera_model(reconstruction.cameras.model)
     ends, spread, prefix = lines.segments.T, lines.spread.T / unit**2, model.prefix
     if f"{prefix}_line_residual" in SIGNATURES:
-        return Segments(lines.view, lines.line, *map(_whole, (ends, spread)), prefix)
+        return Segments(lines.view, lines.line, _whole(ends), _whole(spread), prefix)
     K = reconstruction._calibrations()
     params = reconstruction.cameras.of_views[lines.view].T
     moved, covariances = ends.copy(), spread.copy()
@@ -95,8 +95,7 @@ def segments_of(
         S = D @ S @ np.swapaxes(D, 1, 2)
         covariances[3 * k : 3 * k + 3] = S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]
     intrinsics = np.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]], axis=1)
-    parts = map(_whole, (moved, covariances))
-    return Segments(lines.view, lines.line, *parts, "pinhole", intrinsics)
+    return Segments(lines.view, lines.line, moved, covariances, "pinhole", intrinsics)
 
 
 def _whole(array: Array) -> Array:
@@ -210,8 +209,8 @@ def _triangulated(
 
 def _deviations(V: Array) -> Array:
     """Return the largest standard deviation that blocks (L, 4, 4) leave; it may be infinite."""
-    finite = np.isfinite(V).all(axis=(1, 2))
-    values = np.linalg.eigvalsh(np.where(finite[:, None, None], V, 0.0))
+    finite = np.all(np.isfinite(V), axis=(1, 2), keepdims=True)
+    values = np.linalg.eigvalsh(np.where(finite, V, 0.0))
     least = np.where(values[:, 0] > _ROUNDING * values[:, -1], values[:, 0], 0.0)
     with np.errstate(divide="ignore"):
         return np.asarray(1.0 / np.sqrt(least))
@@ -240,7 +239,8 @@ def _nearest(segments: Segments, cameras: Array, count: int) -> Array:
     v = np.cross(A[:, :3], B[:, :3])
     n = A[:, 3:] * B[:, :3] - B[:, 3:] * A[:, :3]
     with np.errstate(all="ignore"):
-        return np.concatenate([n, v], axis=1) / np.linalg.norm(v, axis=1, keepdims=True)
+        rows = np.concatenate([n, v], axis=1) / np.linalg.norm(v, axis=1, keepdims=True)
+        return np.asarray(rows)
 
 
 class LineJob(NamedTuple):
@@ -387,8 +387,9 @@ def adjusted_lines(
     assert isinstance(problem.linearizer, FeatureLinearizer)
     r = problem.linearizer.observe(cameras, features)[0]
     rank, condition = 0, float("inf")
-    if isinstance(outcome.system, BundleSystem) and np.isfinite(outcome.state.cost):
-        rank, missing, condition = _determined(outcome.system, job)
+    system: Any = outcome.system() if callable(outcome.system) else outcome.system
+    if isinstance(system, BundleSystem) and np.isfinite(outcome.state.cost):
+        rank, missing, condition = _determined(system, job)
         weights = problem.linearizer.weights
         counts = weights > 0.0
         share = max(1.0 - rank / max(2 * int(np.count_nonzero(counts)), 1), 1e-3)
@@ -399,7 +400,7 @@ def adjusted_lines(
             raised.update(gross_flags(sizes, usual, np.concatenate([tracks.xy, middles])[counts]))
         if missing:
             raised.add("undetermined")
-        V = outcome.system.normal.V[m:]
+        V = system.normal.V[m:]
         if (usual * _deviations(V) > _OPEN).any():
             raised.add("open lines")
     line_fun = tracks.unit * np.ascontiguousarray(r[:, len(tracks) :].T)
