@@ -40,7 +40,7 @@ def plot_bundle(
     Parameters
     ----------
     result : BundleResult
-        What `bundle_adjust` returned for these tracks.
+        What `epigauge.bundle_adjust` returned for these tracks.
     tracks : Tracks
         Observations.
     title : str

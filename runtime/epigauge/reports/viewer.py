@@ -55,7 +55,7 @@ def save_viewer(
     path : str or path
         The file: ``.html``.
     result : BundleResult
-        What `bundle_adjust` returned for these tracks.
+        What `epigauge.bundle_adjust` returned for these tracks.
     tracks : Tracks
         Observations.
     title : str

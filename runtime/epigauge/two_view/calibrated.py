@@ -36,7 +36,7 @@ def estimate_essential(
         At least eight different matches in pixels.
     K1, K2 : array_like, shape (3, 3)
         Calibration matrices; `K2` is `K1` by default.
-    robust, threshold_px, score, seed
+    robust, threshold_px, score, seed : optional
         As for `estimate_fundamental`.
     **options
         Of `refine_fundamental`, but for `F0`, `essential`, `K1` and `K2`.

@@ -81,7 +81,7 @@ def refine_homography(
         several equal matches one counts.
     H0 : array_like, shape (3, 3), optional
         Start with ``x2 ~ H0 x1``; by default an algebraic fit, robust where the loss is.
-    loss, loss_scale_px
+    loss, loss_scale_px : optional
         Robust loss of each match's squared distance, and its scale in pixels, as for
         `refine_fundamental`.
     noise_px : float, optional
@@ -91,7 +91,7 @@ def refine_homography(
         Factor of each match's squared distance.
     covariance1, covariance2 : array_like, shape (2, 2) or (m, 2, 2), optional
         Covariances of the points in px^2; distances are then in units of the noise.
-    ftol, xtol, gtol, max_iter, backend, callback
+    ftol, xtol, gtol, max_iter, backend, callback : optional
         As for `refine_fundamental`.
 
     Returns

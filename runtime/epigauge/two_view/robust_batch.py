@@ -90,7 +90,7 @@ def estimate_fundamental_batch(
         The raw matches of all pairs, one pair after the other, in pixels.
     offsets : array_like of int, shape (n + 1,)
         Pair k has the matches ``offsets[k]:offsets[k + 1]``; from 0 to m.
-    robust, threshold_px
+    robust, threshold_px : optional
         As of `estimate_fundamental`.
     score : array_like, shape (m,), optional
         How promising each match is.
