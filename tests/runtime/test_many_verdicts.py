@@ -5,17 +5,22 @@ from __future__ import annotations
 import copy
 import itertools
 import pickle
+import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import epigauge as eg
 import many_views
 import numpy as np
 import pytest
+from epigauge.multi_view import result as results
 from epigauge.multi_view.parallax import fit_homographies
 from epigauge.multi_view.seen import Seen
 from epigauge.multi_view.verdicts.counting import missing_by_count
 from epigauge.multi_view.verdicts.front import behind
+from epigauge.multi_view.verdicts.verdict import Verdict
 from epigauge.verdicts import FLAGS, usable
 from numpy.typing import NDArray
 
@@ -253,6 +258,72 @@ class TestVerdictWhenAsked:
         for made in (copy.copy(found()), copy.deepcopy(found()), pickled):
             assert "flags" in vars(made)
             assert "_judge" not in vars(made)
+
+    def test_changing_what_was_fixed_does_not_change_it(self) -> None:
+        scene = eg.multi_view_scene(n_points=30, seed=2)
+        found = []
+        for factor in (1.0, 3.0):
+            start = eg.initialize(scene.tracks)
+            result = eg.bundle_adjust(scene.tracks, start, fixed_views=[0], fixed_points=[4])
+            start.P[0, 1] *= factor
+            start.Q[4, :2] *= factor
+            found.append((result.condition, result.rank, result.n_behind, result.flags))
+        assert found[0] == found[1]
+
+    def test_threads_that_ask_together_judge_once(self) -> None:
+        made = self.found()
+        judge, calls = vars(made)["_judge"], []
+
+        def slowly() -> Verdict:
+            calls.append(made)
+            time.sleep(0.1)
+            return judge()
+
+        vars(made)["_judge"] = slowly
+        with ThreadPoolExecutor(4) as pool:
+            told = list(pool.map(lambda _: made.condition, range(4)))
+        assert len(calls) == 1
+        assert told == [self.found().condition] * 4
+
+    @pytest.mark.parametrize("kind", [AttributeError, np.linalg.LinAlgError])
+    def test_a_verdict_that_fails_is_no_missing_field(self, kind: type[Exception]) -> None:
+        made = self.found()
+
+        def fails() -> Verdict:
+            raise kind("within")
+
+        vars(made)["_judge"] = fails
+        for _ in range(2):  # nor is it forgotten that it is still to be made
+            with pytest.raises((RuntimeError, np.linalg.LinAlgError), match="within"):
+                getattr(made, "flags", ())
+            with pytest.raises((RuntimeError, np.linalg.LinAlgError), match="within"):
+                made.summary()
+
+    def test_no_threads_are_left_to_the_verdict(self) -> None:
+        scene = eg.multi_view_scene(n_views=8, n_points=2000, noise_px=0.5, seed=2)
+        start = eg.initialize(scene.tracks)
+        assert "flags" in vars(eg.bundle_adjust(scene.tracks, start, workers=2, max_iter=1))
+
+    def test_only_the_last_adjustment_without_gross_errors_is_judged(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        scene = eg.multi_view_scene(n_points=60, noise_px=0.5, seed=4)
+        xy = scene.tracks.xy.copy()
+        xy[::4] += np.random.default_rng(0).uniform(-60.0, 60.0, xy[::4].shape)
+        tracks = eg.Tracks(scene.tracks.view, scene.tracks.point, xy)
+        made, judged = [], []
+        unjudged, told = eg.BundleResult.unjudged, results._told
+
+        def counted(judge: Any, **known: Any) -> eg.BundleResult:
+            made.append(known)
+            return unjudged(judge, **known)
+
+        monkeypatch.setattr(eg.BundleResult, "unjudged", counted)
+        monkeypatch.setattr(results, "_told", lambda *of: judged.append(of) or told(*of))
+        found = eg.bundle_adjust(tracks, eg.initialize(tracks, robust=True), robust=True)
+        assert np.count_nonzero(found.rejected) > 0.8 * len(xy[::4])
+        assert "set aside as gross errors" in found.message
+        assert len(judged) == 1 < len(made)
 
     def test_what_no_result_has_is_no_attribute(self) -> None:
         with pytest.raises(AttributeError, match="no attribute 'weight'"):

@@ -150,10 +150,13 @@ def uncalibrated_job(
     def measured(xy: Array) -> Array:
         return frame.points_in(xy, tracks.view)
 
+    # Copies: results are made of them whenever one is judged, and the start may change meanwhile.
+    fixed = start.P[views], points[held]
+
     def result(cameras: Array, found: Array) -> AnyReconstruction:
         P, found = frame.cameras_out(cameras.reshape(-1, 3, 4)), found.copy()
         # What was fixed comes back as it was, to the last bit.
-        P[views], found[held] = start.P[views], points[held]
+        P[views], found[held] = fixed
         return AffineReconstruction(P[:, :2], found) if affine else Reconstruction(P, found)
 
     rows = frame.cameras_in(start.P).reshape(-1, _POSE)

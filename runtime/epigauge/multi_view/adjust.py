@@ -361,8 +361,8 @@ def bundle_adjust(
         status=outcome.status,
         history=outcome.history,
     )
-    if threads is not workers:
-        result.judge()  # while the workers are there
+    if workers != 1:
+        result.judge()  # while the workers are there: threads do not outlive a fork
     return result
 
 

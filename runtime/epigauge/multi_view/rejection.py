@@ -97,13 +97,15 @@ def without_gross_errors(
         kept = search.without(rejected)
         begun = search.out_of_the_way(start, rejected)
         found = adjust(kept, begun, loss=loss[0], loss_scale_px=loss[1])
-        found = search.restored(found, start, rejected)
-        found = replace(found, rejected=rejected, message=_told(found.message, rejected))
-        start, told = found.reconstruction, search.gross(found.reconstruction)
-        if found.status == -2 or np.mean(told != rejected) < _SETTLED:
+        start, aside = search.restored(found.reconstruction, start, rejected), rejected
+        rejected = search.gross(start)
+        if found.status == -2 or np.mean(rejected != aside) < _SETTLED:
             break
-        rejected = told
-    return found
+    moved = start is not found.reconstruction
+    fun = tracks.xy - start.project(tracks) if moved else found.fun
+    # The last one alone: a copy is judged, which those before need not be.
+    message = _told(found.message, aside)
+    return replace(found, reconstruction=start, fun=fun, rejected=aside, message=message)
 
 
 def _told(message: str, rejected: Mask) -> str:
@@ -183,15 +185,12 @@ class _Search:
         lost = self.lost(rejected)[:, None]
         return Reconstruction(found.P, np.where(lost, found.Q[np.argmax(kept)], found.Q))
 
-    def restored(self, found: BundleResult, before: Any, rejected: Mask) -> BundleResult:
-        """Return the result with such points where they were before."""
-        after = found.reconstruction
+    def restored(self, after: Any, before: Any, rejected: Mask) -> Any:
+        """Return the reconstruction with such points where they were before."""
         if not (isinstance(before, Reconstruction) and isinstance(after, Reconstruction)):
-            return found
+            return after
         Q = np.where(self.lost(rejected)[:, None], before.Q, after.Q)
-        reconstruction = Reconstruction(after.P, Q)
-        fun = self.tracks.xy - reconstruction.project(self.tracks)
-        return replace(found, reconstruction=reconstruction, fun=fun)
+        return Reconstruction(after.P, Q)
 
     def without(self, rejected: Mask) -> Tracks:
         """Return the tracks with weight zero for what is set aside."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -78,7 +79,8 @@ class BundleResult(Result):
     Notes
     -----
     Flags, rank, n_behind, condition, weakest, message and success are computed when the first of
-    them is asked for: the verdict on a few hundred points takes as long as their adjustment.
+    them is asked for: the verdict on a few hundred points takes as long as their adjustment. Until
+    then the result holds the normal equations; with several workers it is judged at once.
     """
 
     _shown: ClassVar[tuple[str, ...]] = (
@@ -120,21 +122,28 @@ class BundleResult(Result):
             All fields that do not depend on it.
         """
         made = object.__new__(cls)
-        made.__dict__.update(known, _judge=judge)
+        made.__dict__.update(known, _judge=judge, _judging=threading.Lock())
         return made
 
     def judge(self) -> None:
         """Compute what is a matter of the verdict now; asking for any of it does the same."""
-        judge = self.__dict__.get("_judge")
-        if judge is not None:
-            self.__dict__.update(_told(judge(), self.status))
-            self.__dict__.pop("_judge", None)  # another thread may have judged meanwhile
+        waiting = self.__dict__.get("_judging")
+        if waiting is None:
+            return
+        with waiting:  # threads would write to the same normal equations
+            judge = self.__dict__.get("_judge")
+            if judge is not None:
+                self.__dict__.update(_told(judge(), self.status))
+                del self.__dict__["_judge"]
 
     if not TYPE_CHECKING:  # to a type checker all fields are there
 
         def __getattr__(self, name: str) -> Any:
             if name in _JUDGED:
-                self.judge()
+                try:
+                    self.judge()
+                except AttributeError as error:  # `getattr` would take it for no such field
+                    raise RuntimeError(f"the result cannot be judged: {error}") from error
             if name not in self.__dict__:
                 raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
             return self.__dict__[name]
