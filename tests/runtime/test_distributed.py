@@ -184,6 +184,9 @@ def test_what_cannot_be_used_is_named(client: Any) -> None:
         eg.distributed.bundle_adjust(tracks, client, start, partitions=0)
     with pytest.raises(eg.ArgumentError, match="workers"):
         eg.distributed.bundle_adjust(tracks, client, start, workers=2)
+    scene = eg.line_scene(n_views=3, n_points=8, n_lines=4)
+    with pytest.raises(eg.ArgumentError, match="lines is given beside a client"):
+        eg.distributed.bundle_adjust(scene.tracks, client, scene.true, lines=scene.line_tracks)
 
 
 def test_a_closed_client_is_named(client: Any) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 
 import epigauge as eg
 import numpy as np
 import pytest
 from epigauge import lm
 from epigauge.bundle.dampings import Covariant
-from epigauge.bundle.lines import moved_lines
 from epigauge.bundle.similarity import Similarity
 from epigauge.cameras import camera_model
 from epigauge.kernels import table
@@ -92,7 +92,7 @@ def test_steps_are_the_same_in_twenty_frames():
         if there is not None:
             cameras, X = there.apply(scene.true.vectors, scene.true.X)
             pose = cameras[:, :12].reshape(-1, 3, 4)
-            lines = moved_lines(there, scene.true.lines)
+            lines = there.lines(scene.true.lines)
             parts = scene.true.cameras, lines
             start = eg.MetricReconstruction(pose[:, :, :3], pose[:, :, 3], X, *parts)
         made, _ = line_job(scene.tracks, start, scene.line_tracks, table())
@@ -239,3 +239,82 @@ def test_scenes_keep_their_lines(tmp_path, scene):
     assert (found.lines == scene.true.lines).all()
     assert (copy.deepcopy(found).lines == found.lines).all()
     assert len(tracks) == len(scene.tracks)
+
+
+def test_deviations_of_all_measurements_leave_residuals_in_pixels(scene):
+    parts, options = (scene.tracks, scene.line_tracks), {"refine": "pose", "ftol": 1e-14}
+    tracks, lines = parts
+    wider = eg.Tracks(tracks.view, tracks.point, tracks.xy, sigma=0.5)
+    segments = eg.LineTracks(lines.view, lines.line, lines.segments, sigma=0.5)
+    plain = eg.bundle_adjust(tracks, scene.true, lines=lines, **options)
+    found = eg.bundle_adjust(wider, scene.true, lines=segments, **options)
+    np.testing.assert_allclose(found.line_fun, plain.line_fun, atol=1e-6)
+    total = np.sum(found.fun**2) + np.sum(found.line_fun**2)
+    np.testing.assert_allclose(0.5 * total, found.cost, rtol=1e-9)
+
+
+def test_a_similarity_takes_lines_along(scene):
+    seen = eg.triangulate_lines(scene.line_tracks, scene.true)
+    v = scene.true.lines[:, 3:]
+    points = np.cross(v, scene.true.lines[:, :3])  # of each line the one nearest to the origin
+    for there in similarities(3):
+        R, t = there.rotation, there.target - there.scale * there.rotation @ there.origin
+        moved = eg.gauge.transform(scene.true, eg.gauge.similarity(there.scale, R, t))
+        X, turned = there.positions(points), v @ R.T
+        size = np.linalg.norm(moved.lines, axis=1).max()
+        wanted = np.column_stack([np.cross(X, turned), turned])
+        np.testing.assert_allclose(moved.lines, wanted, atol=1e-12 * size)
+        # Cameras that are moved see the lines there.
+        again = eg.triangulate_lines(scene.line_tracks, moved)
+        assert off(again, there.lines(seen)).max() < 1e-6 * size
+
+
+def test_other_axes_of_cameras_keep_the_lines(scene):
+    tracks, true = eg.interop.colmap_to_bal(scene.tracks, scene.true)
+    assert (true.lines == scene.true.lines).all()
+    back = eg.interop.bal_to_colmap(tracks, true, (1000, 1000))[1]
+    assert (back.lines == scene.true.lines).all()
+
+
+@pytest.mark.parametrize("name", ["folder", "scene.txt", "scene.out", "scene.glb", "scene.json"])
+def test_a_form_without_lines_is_refused(tmp_path, scene, name):
+    with pytest.raises(eg.ArgumentError, match=r"lines are 60, which only NPZ"):
+        eg.save_scene(tmp_path / name, scene.tracks, scene.true)
+    assert not list(tmp_path.iterdir())
+
+
+def test_points_alone_do_not_tell_how_sure_lines_made_cameras(scene, adjusted):
+    with pytest.raises(eg.ArgumentError, match="has 60 lines"):
+        eg.covariance(scene.tracks, adjusted.reconstruction)
+    alone = eg.bundle_adjust(scene.tracks, adjusted.reconstruction)
+    assert alone.reconstruction.lines is None
+    assert eg.covariance(scene.tracks, alone.reconstruction).noise_px > 0
+
+
+def test_the_command_line_does_not_lose_lines(tmp_path, scene, run):
+    eg.save_scene(tmp_path / "scene.npz", scene.tracks, scene.true)
+    code, _, err = run("bundle", tmp_path / "scene.npz", "-o", tmp_path / "out.npz")
+    assert code == 2
+    assert "60 lines" in err
+    assert not (tmp_path / "out.npz").exists()
+
+
+def test_a_start_that_is_none_and_odd_numbers_of_lines_are_named(scene):
+    lines = scene.line_tracks
+    with pytest.raises(eg.ArgumentError, match="start is a NoneType"):
+        eg.bundle_adjust(scene.tracks, lines=lines)
+    parts = lines.view, lines.line, lines.segments
+    for bad in (59.5, "60", np.nan, [60, 61], True, 0):
+        with pytest.raises(eg.ArgumentError, match="n_lines"):
+            eg.LineTracks(*parts, bad)
+    for many in (61, 10**12):
+        with pytest.raises(eg.ArgumentError, match=r"60.* is seen by fewer than two views"):
+            eg.LineTracks(*parts, many)
+    far = np.where(lines.line == 59, 10**12, lines.line)
+    with pytest.raises(eg.ArgumentError, match=r"59.* is seen by fewer than two views"):
+        eg.LineTracks(lines.view, far, lines.segments)
+
+
+def test_text_tells_of_lines(scene):
+    assert "60 points, 60 lines, Cameras" in repr(scene.true)
+    assert "lines" not in repr(dataclasses.replace(scene.true, lines=None))

@@ -18,7 +18,6 @@ from epigauge.bundle.freedom import Freedom
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.problem import BundleProblem, BundleState
-from epigauge.bundle.similarity import Similarity
 from epigauge.bundle.ties import Ties
 from epigauge.multi_view.measured import whitened
 
@@ -29,7 +28,6 @@ __all__ = [
     "feature_freedom",
     "features_of",
     "joint_graph",
-    "moved_lines",
     "unit_lines",
 ]
 
@@ -184,14 +182,6 @@ def joint_graph(graph: ObservationGraph, segments: Segments, count: int) -> Obse
         point=np.concatenate([graph.point, graph.n_points + segments.line]),
         n_points=graph.n_points + count,
     )
-
-
-def moved_lines(there: Similarity, lines: Array) -> Array:
-    """Return lines (L, 6) after a similarity of space."""
-    n, v = lines[:, :3], lines[:, 3:]
-    turned = v @ there.rotation.T
-    moment = there.scale * (n - np.cross(there.origin, v)) @ there.rotation.T
-    return np.concatenate([moment + np.cross(there.target, turned), turned], axis=1)
 
 
 def unit_lines(lines: Array) -> Array:

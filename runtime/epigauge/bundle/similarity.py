@@ -59,6 +59,24 @@ class Similarity:
         """
         return np.asarray(self.scale * (X - self.origin) @ self.rotation.T + self.target)
 
+    def lines(self, lines: Array) -> Array:
+        """Return moved lines.
+
+        Parameters
+        ----------
+        lines : ndarray, shape (L, 6)
+            Pluecker coordinates (n, v), n = X x v for the points X of the line.
+
+        Returns
+        -------
+        ndarray, shape (L, 6)
+            Where they go; v turns, and keeps its length.
+        """
+        n, v = lines[:, :3], lines[:, 3:]
+        turned = v @ self.rotation.T
+        moment = self.scale * (n - np.cross(self.origin, v)) @ self.rotation.T
+        return np.concatenate([moment + np.cross(self.target, turned), turned], axis=1)
+
     def information(self, blocks: Array) -> Array:
         """Return moved inverse covariances of positions.
 

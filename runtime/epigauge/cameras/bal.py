@@ -123,7 +123,7 @@ def colmap_to_bal(
 
 def _turned(reconstruction: MetricReconstruction, cameras: Cameras) -> MetricReconstruction:
     R, t = _TURN @ reconstruction.R, reconstruction.t @ _TURN
-    return MetricReconstruction(R, t, reconstruction.X, cameras)
+    return MetricReconstruction(R, t, reconstruction.X, cameras, reconstruction.lines)
 
 
 def _with(tracks: Tracks, xy: Array, **labels: Any) -> Tracks:

@@ -172,7 +172,9 @@ class MetricReconstruction(ReconstructionBase):
         return np.ascontiguousarray(pixels.T), depths
 
     def to_projective(self) -> Reconstruction:
-        """Return the scene as projective cameras and points; distortion has no place there.
+        """Return the scene as projective cameras and points.
+
+        Distortion and lines have no place there.
 
         Returns
         -------
@@ -227,7 +229,8 @@ class MetricReconstruction(ReconstructionBase):
 
     def __repr__(self) -> str:
         views, points = counted(self.n_views, "view"), counted(self.n_points, "point")
-        return f"MetricReconstruction({views}, {points}, {self.cameras!r})"
+        lines = "" if self.lines is None else f"{counted(len(self.lines), 'line')}, "
+        return f"MetricReconstruction({views}, {points}, {lines}{self.cameras!r})"
 
 
 def _checked_lines(lines: Any) -> Array:

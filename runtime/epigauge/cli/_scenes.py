@@ -111,6 +111,10 @@ class SceneJob:
         if not isinstance(self.start, eg.MetricReconstruction):
             was = "is given with cameras that are not calibrated"
             raise ArgumentError("--refine", was, "a scene with calibrated ones, or none")
+        if self.start.lines is not None:
+            was = f"has {len(self.start.lines)} lines, which would be lost"
+            needed = "one without lines; eg.bundle_adjust(..., lines=...) of Python adjusts them"
+            raise ArgumentError("scene", was, needed)
         model = self.start.cameras.model
         if image_size is not None and model != "bal":
             was = f"is given with cameras of the model {model}"

@@ -124,7 +124,7 @@ def bundle_adjust(
         How the reduced system is solved: by a factor, computed here, or by conjugate gradients,
         whose products the workers compute. By default the first, unless it fills too much.
     **options
-        All those of `epigauge.bundle_adjust` but `workers`.
+        All those of `epigauge.bundle_adjust` but `workers` and `lines`.
 
     Returns
     -------
@@ -154,6 +154,9 @@ def bundle_adjust(
         partitions = as_count("partitions", partitions)
     if "workers" in options:
         raise ArgumentError("workers", "is given beside a client", "the client alone")
+    if options.get("lines") is not None:
+        needed = "none: eg.bundle_adjust adjusts lines in one process"
+        raise ArgumentError("lines", "is given beside a client", needed)
     workers = Workers(client, partitions, solver)
     try:
         there: Any = workers

@@ -129,7 +129,7 @@ def save_scene(
         Observations. Those of `load_scene` keep COLMAP's numbers of images, cameras and points, its
         features without points, rigs and frames.
     reconstruction : MetricReconstruction, AffineReconstruction or Reconstruction
-        Of the same views and points; only NPZ holds the last two.
+        Of the same views and points; only NPZ holds the last two, and lines.
     text : bool
         Write a COLMAP folder as text, not binary.
     rigs : {"keep", "drop"}
@@ -191,6 +191,10 @@ def scene_content(
     if not isinstance(reconstruction, MetricReconstruction):
         was = f"is a {type(reconstruction).__name__}, which has no calibrated cameras"
         raise ArgumentError("reconstruction", was, "a name ending in .npz")
+    if reconstruction.lines is not None:
+        was = f"are {len(reconstruction.lines)}, which only NPZ has a place for"
+        needed = "a name ending in .npz, or dataclasses.replace(reconstruction, lines=None)"
+        raise ArgumentError("reconstruction.lines", was, needed)
     if not is_scene_file(path):
         return model_of(tracks, reconstruction, rigs)
     if path.suffix.lower() in _EXPORTS:

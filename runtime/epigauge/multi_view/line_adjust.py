@@ -20,7 +20,6 @@ from epigauge.bundle.lines import (
     feature_freedom,
     features_of,
     joint_graph,
-    moved_lines,
     unit_lines,
 )
 from epigauge.bundle.observations import ObservationGraph
@@ -160,7 +159,7 @@ def triangulate_lines(
     >>> eg.triangulate_lines(scene.line_tracks, scene.true).shape
     (60, 6)
     """
-    _metric(reconstruction)
+    _metric("reconstruction", reconstruction)
     found, deviations = _triangulated(lines, reconstruction, kernels.table(backend))
     bad = np.flatnonzero(~(deviations <= _OPEN))
     if len(bad):
@@ -171,10 +170,10 @@ def triangulate_lines(
     return found
 
 
-def _metric(reconstruction: Any) -> None:
-    if not isinstance(reconstruction, MetricReconstruction):
-        was = f"is a {type(reconstruction).__name__}"
-        raise ArgumentError("reconstruction", was, "an eg.MetricReconstruction, as lines need")
+def _metric(name: str, scene: Any) -> None:
+    if not isinstance(scene, MetricReconstruction):
+        was = f"is a {type(scene).__name__}"
+        raise ArgumentError(name, was, "an eg.MetricReconstruction, as lines need")
 
 
 def _triangulated(
@@ -204,7 +203,7 @@ def _triangulated(
     J = linearizer.observe(cameras, refined)[2]
     deviations = _deviations(alone.sum_points(np.einsum("ikn,iln->nkl", J, J)))
     deviations[bad | ~np.isfinite(refined).all(axis=1)] = np.inf
-    return moved_lines(home.inverse(), refined), deviations
+    return home.inverse().lines(refined), deviations
 
 
 def _deviations(V: Array) -> Array:
@@ -280,7 +279,7 @@ def line_job(
     embedded: bool = True,
 ) -> tuple[LineJob, float]:
     """Return the problem of points and lines, and the scale of the loss in pixels."""
-    _metric(start)
+    _metric("start", start)
     segments = segments_of(lines, start, tracks.unit)
     if segments.intrinsics is not None and refine != "pose":
         was = f"is {refine!r} with lines in {start.cameras.model} cameras, which bend lines"
@@ -312,7 +311,7 @@ def line_job(
         segments=segments,
         n_points=tracks.n_points,
     )
-    features = features_of(points, moved_lines(home, first))
+    features = features_of(points, home.lines(first))
     scale = 0.0
     if loss != "linear":
         scale = float(loss_scale_px) if loss_scale_px != "auto" else 0.0
@@ -379,7 +378,7 @@ def adjusted_lines(
     back = home.inverse()
     whole = job.result(*back.apply(cameras, features[:m, :3]))
     assert isinstance(whole, MetricReconstruction)
-    space = unit_lines(moved_lines(back, features[m:]))
+    space = unit_lines(back.lines(features[m:]))
     found = MetricReconstruction(whole.R, whole.t, whole.X, whole.cameras, space)
     predicted, depths = found.seen(tracks)
     n_behind = int(np.count_nonzero(~(depths > 0.0)))
@@ -403,7 +402,7 @@ def adjusted_lines(
         V = system.normal.V[m:]
         if (usual * _deviations(V) > _OPEN).any():
             raised.add("open lines")
-    line_fun = tracks.unit * np.ascontiguousarray(r[:, len(tracks) :].T)
+    line_fun = np.ascontiguousarray(r[:, len(tracks) :].T)
     fun = tracks.xy - predicted
     flags = ordered(raised)
     return Adjusted(found, outcome, fun, line_fun, flags, rank, n_behind, condition, scale)

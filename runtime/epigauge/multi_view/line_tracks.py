@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epigauge._arguments import MAX_PX, as_real
+from epigauge._arguments import MAX_PX, as_count, as_real
 from epigauge._results import Result
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.labels import view_names
@@ -93,7 +93,7 @@ class LineTracks(Result):
             raise ArgumentError(
                 "segments", f"is {what} in row {bad[0]}", f"pixels below {MAX_PX:g}"
             )
-        self.n_lines = int(lines.max()) + 1 if n_lines is None else int(n_lines)
+        self.n_lines = int(lines.max()) + 1 if n_lines is None else as_count("n_lines", n_lines)
         if self.n_lines <= lines.max():
             raise ArgumentError("line", f"names {lines.max()}", f"0 to {self.n_lines - 1}")
         spread = _spread(sigma, covariance, len(views))
@@ -109,7 +109,9 @@ class LineTracks(Result):
             was = f"name view {self.view[k]}, line {self.line[k]} twice"
             rows = f" (rows {self.order[k]} and {self.order[k + 1]})"
             raise ArgumentError("view, line", was + rows, "one segment of a line in a view")
-        weak = np.flatnonzero(np.bincount(self.line, minlength=self.n_lines) < MIN_VIEWS)
+        # Of more lines than rows some of the first are seen too rarely: no longer array is made.
+        few = min(self.n_lines, len(lines))
+        weak = np.flatnonzero(np.bincount(lines[lines < few], minlength=few) < MIN_VIEWS)
         if len(weak):
             named = ", ".join(map(str, weak[:5])) + (", ..." if len(weak) > 5 else "")
             needed = "lines seen by two views at least: one view leaves a plane of lines"

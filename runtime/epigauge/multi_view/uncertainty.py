@@ -318,7 +318,7 @@ def covariance(
         Observations that the reconstruction was adjusted to, with their weights: zero for those
         that were set aside.
     reconstruction : Reconstruction, MetricReconstruction or AffineReconstruction
-        Cameras and points at the minimum.
+        Cameras and points at the minimum; adjusted without lines.
     gauge : Gauge or "inner", optional
         Of a metric reconstruction, which is not moved, the datum: "inner" (default) for inner
         constraints over all points, ``eg.gauge.inner(points=..., views=...)`` over some,
@@ -354,9 +354,9 @@ def covariance(
     Raises
     ------
     ArgumentError
-        If the reconstruction has another size, there is nothing to estimate the noise from, the
-        observations do not determine the reconstruction, or the gauge is not one of `eg.gauge`
-        and has no method `constraints`.
+        If the reconstruction has another size or lines, there is nothing to estimate the noise
+        from, the observations do not determine the reconstruction, or the gauge is not one of
+        `eg.gauge` and has no method `constraints`.
 
     Notes
     -----
@@ -398,6 +398,10 @@ def covariance(
         needed = "an eg.Reconstruction, MetricReconstruction or AffineReconstruction"
         raise ArgumentError("reconstruction", was, needed)
     if isinstance(reconstruction, MetricReconstruction):
+        if reconstruction.lines is not None:
+            was = f"has {len(reconstruction.lines)} lines, which count as observations, too"
+            needed = "one adjusted to points alone: eg.bundle_adjust without lines"
+            raise ArgumentError("reconstruction", was, needed)
         datum = "inner" if gauge is None else gauge
         options: Any = {**of_metric, "backend": backend}
         options |= {"loss": loss, "loss_scale_px": loss_scale_px}

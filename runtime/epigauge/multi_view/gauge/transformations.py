@@ -178,7 +178,7 @@ def transform(
     -------
     Reconstruction, MetricReconstruction or AffineReconstruction
         P_i' = gamma_i P_i T, Q_j' = alpha_j T^-1 Q_j; or X' = s R X + t, and cameras that see it
-        as before.
+        as before; lines move along.
 
     Raises
     ------
@@ -195,7 +195,9 @@ def transform(
         _no_scales("metric", camera_scales, point_scales)
         moved, X = T.apply(reconstruction.vectors, reconstruction.X)
         pose = moved[:, :12].reshape(-1, 3, 4)
-        return MetricReconstruction(pose[:, :, :3], pose[:, :, 3], X, reconstruction.cameras)
+        lines = None if reconstruction.lines is None else T.lines(reconstruction.lines)
+        parts = pose[:, :, :3], pose[:, :, 3], X, reconstruction.cameras
+        return MetricReconstruction(*parts, lines)
     matrix = as_real("T", T, "a finite (4, 4) matrix")
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise ArgumentError("T", f"has shape {matrix.shape}", "a finite (4, 4) matrix")
