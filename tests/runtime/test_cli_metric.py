@@ -49,6 +49,20 @@ def test_json_has_everything(run, tmp_path: Path) -> None:
     assert found["focal_std_px"] > 0.0
 
 
+@pytest.mark.parametrize("camera", ["SIMPLE_PINHOLE", "PINHOLE"])
+def test_the_report_says_what_deviations_are_made_of(run, tmp_path: Path, camera: str) -> None:
+    path = tmp_path / "tracks.npz"
+    tracks, _ = tracks_of("general", 1, noise_px=0.3, n_points=80, bend=-0.03)
+    eg.save_tracks(path, tracks)
+    code, out, err = run("metric", path, "--image-size", *SIZE, "--camera", camera)
+    assert code == 0
+    wide = "f" if camera == "SIMPLE_PINHOLE" else "mean f"
+    words = " ".join(err.replace("│", " ").split())
+    assert f"{wide} with errors of the model, all else of noise alone" in words
+    value, std = map(float, out.split())
+    assert f"{wide} {value:.7g} +- {std:.3g} px" in words
+
+
 def test_a_motion_that_says_nothing_ends_with_one_and_no_file(run, tmp_path: Path) -> None:
     for motion, flag in (("translation", "pure translation"), ("rotation", "pure rotation")):
         path = _saved(tmp_path, motion)

@@ -219,7 +219,14 @@ def camera_rows(result: eg.MetricUpgrade, cameras: eg.Cameras) -> dict[str, str]
             label = name if len(cameras) == 1 else f"{name} of camera {c}"
             end = f"+- {sigma:.3g}" if name in result.refined else "(not refined)"
             rows[label] = f"{value:.7g} {end}{' px' if unit == 'px' else ''}"
+        if len(model.focal) > 1:
+            label = "mean f" if len(cameras) == 1 else f"mean f of camera {c}"
+            focal, sigma = np.atleast_1d(result.focal_px)[c], np.atleast_1d(result.focal_std_px)[c]
+            rows[label] = f"{focal:.7g} +- {sigma:.3g} px"
     if len(cameras) > 3:
         focal, std = np.atleast_1d(result.focal_px), np.atleast_1d(result.focal_std_px)
         rows["all f"] = ", ".join(f"{f:.5g} +- {s:.2g}" for f, s in zip(focal, std, strict=True))
+    if result.covariance is not None:
+        wide = "f" if len(model.focal) == 1 else "mean f"
+        rows["deviations"] = f"{wide} with errors of the model, all else of noise alone"
     return rows

@@ -70,7 +70,7 @@ class MetricUpgrade:
     bundle : BundleResult or None
         The last adjustment.
     covariance : MetricCovariance or None
-        Of everything.
+        Of everything, by the noise of independent observations alone: `focal_std_px` is wider.
     """
 
     reconstruction: MetricReconstruction | None = field(repr=False)
