@@ -209,6 +209,13 @@ def test_bad_observations_are_refused(view, line, segments, options, message):
         eg.LineTracks(view, line, segments, **options)
 
 
+@pytest.mark.parametrize("scale_px", [-1.0, 0.0, np.nan, "x"])
+def test_a_scale_that_is_none_is_refused(scene, scale_px):
+    options = {"loss": "huber", "loss_scale_px": scale_px}
+    with pytest.raises(eg.ArgumentError, match="loss_scale_px"):
+        eg.bundle_adjust(scene.tracks, scene.true, lines=scene.line_tracks, **options)
+
+
 def test_what_lines_do_not_go_with_is_refused(scene):
     lines = scene.line_tracks
     for options, name in (

@@ -10,7 +10,7 @@ from epigauge_generated.signatures import SIGNATURES
 from numpy.typing import NDArray
 
 from epigauge import kernels, lm
-from epigauge._arguments import as_choice
+from epigauge._arguments import as_choice, as_positive
 from epigauge.bundle.dampings import DAMPINGS, LAM_FLOOR_METRIC, Covariant
 from epigauge.bundle.jobs import Job, metric_job
 from epigauge.bundle.lines import (
@@ -314,8 +314,9 @@ def line_job(
     features = features_of(points, home.lines(first))
     scale = 0.0
     if loss != "linear":
-        scale = float(loss_scale_px) if loss_scale_px != "auto" else 0.0
-        if loss_scale_px == "auto":
+        if loss_scale_px != "auto":
+            scale = as_positive("loss_scale_px", loss_scale_px)
+        else:
             sizes = np.linalg.norm(linearizer.observe(cameras, features)[0], axis=0)
             scale = EFFICIENT[loss] * max(robust_scale(sizes[linearizer.weights > 0.0]), 1e-12)
     retract = job.model.kernel("retract", table.name)
