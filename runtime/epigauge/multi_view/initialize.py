@@ -159,7 +159,7 @@ def _best_factored(tracks: Tracks, frame: Frame, kernels: Table, seed: int) -> R
             found = lm.minimize(problem, Estimate(*moved), Covariant(), lm.Classic(), stopping)
         except np.linalg.LinAlgError:
             continue
-        again = abs(found.state.cost - least) <= _SAME * least
+        again = best is not None and abs(found.state.cost - least) <= _SAME * least
         if best is None or found.state.cost < least:
             best, least = found.state, found.state.cost
         if again:
