@@ -77,3 +77,40 @@ def test_bad_input_is_refused() -> None:
         eg.estimate_two_view(x1[:5], x2[:5])
     with pytest.raises(eg.ArgumentError, match="K1"):
         eg.estimate_two_view(x1, x2, np.zeros((3, 3)))
+
+
+def test_calibration_tells_a_plane_from_a_rotation() -> None:
+    # A plane that the camera moves along: H is that of a rotation, but not with this K.
+    rng = np.random.default_rng(10)
+    x1 = rng.uniform([0.0, 0.0], [1280.0, 960.0], (60, 2))
+    x2 = x1 + np.array([100.0, 0.0])
+    x1, x2 = (x + 0.3 * rng.standard_normal((60, 2)) for x in (x1, x2))
+    assert eg.estimate_two_view(x1, x2).model == "rotation"
+    result = eg.estimate_two_view(x1, x2, K)
+    assert result.model == "plane"
+    assert result.evidence["rotation"]["score"] < 0.0
+    assert "pure rotation" not in result.flags
+
+
+def test_no_motion_is_told_where_no_essential_matrix_was_found() -> None:
+    for seed in range(3):
+        x1 = np.random.default_rng(seed).uniform(0.0, 1000.0, (60, 2))
+        x2 = x1 + np.array([5.0, 0.0])
+        result, found = eg.estimate_two_view(x1, x2, K), eg.estimate_essential(x1, x2, K)
+        assert result.model == "plane"
+        assert (result.E is None) == (result.t is None) == (not found.success)
+
+
+def test_the_message_tells_how_far_a_rotation_is_ahead() -> None:
+    x1, x2, _ = scene("rotation", 60, 0.0, 11)
+    result = eg.estimate_two_view(x1, x2)
+    assert result.model == "rotation"
+    assert f"{result.evidence['plane']['score']:.1f} above" in result.message
+
+
+def test_one_calibration_alone_is_refused() -> None:
+    x1, x2, _ = scene("F", 20, 0.0, 9)
+    with pytest.raises(eg.ArgumentError, match="K1"):
+        eg.estimate_two_view(x1, x2, None, K)
+    with pytest.raises(eg.ArgumentError, match="K1"):
+        eg.estimate_essential(x1, x2, None)  # type: ignore[arg-type]

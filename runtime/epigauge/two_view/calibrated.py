@@ -7,6 +7,7 @@ from typing import Any, Literal
 from numpy.typing import ArrayLike
 
 from epigauge._options import FrontEnd
+from epigauge.errors import ArgumentError
 from epigauge.two_view.robust import RobustResult, estimate_fundamental
 
 __all__ = ["estimate_essential"]
@@ -62,6 +63,8 @@ def estimate_essential(
     >>> bool(result.in_front == np.count_nonzero(result.inlier)), result.t.shape
     (True, (3,))
     """
+    if K1 is None:  # which refine_fundamental takes for coordinates on the retina
+        raise ArgumentError("K1", "is None", "a calibration matrix; np.eye(3) of rays x / z, y / z")
     return estimate_fundamental(
         x1,
         x2,

@@ -64,7 +64,7 @@ class TwoViewResult(Result):
         or "E" with calibration.
     F, E, H : ndarray, shape (3, 3), or None
         What the model has: H for a still camera, a rotation or a plane, F for "F" and "E", E for
-        "E", and for a plane with calibration.
+        "E", and for a plane with calibration, where it was found.
     R, t : ndarray, shape (3, 3) and (3,), or None
         With calibration, the motion ``x2 = R x1 + t``, t of unit length; of a rotation R alone.
     evidence : dict
@@ -163,7 +163,9 @@ def estimate_two_view(
     >>> eg.estimate_two_view(scene.x1, scene.x1).model
     'still'
     """
-    calibration = calibrations(K1 is not None or K2 is not None, K1, K2)
+    if K1 is None and K2 is not None:
+        raise ArgumentError("K1", "is None, but K2 is given", "both calibrations, or neither")
+    calibration = calibrations(K1 is not None, K1, K2)
     x1, x2 = as_matches(x1, x2, at_least=8, general_position=True)
     seed = as_count("seed", seed, at_least=0)
     try:
@@ -176,16 +178,19 @@ def estimate_two_view(
     general = estimate_fundamental(x1, x2, seed=seed, backend=backend, **options)
     name: Model = "F" if calibration is None else "E"
     evidence, R, flat = _evidence(name, x1, x2, general, plane, calibration, backend)
-    model = _model(name, general, plane, flat)
+    model = _model(name, general, plane, flat, evidence)
     usable = model != "nothing" and (general if model == name else plane).status > 0  # type: ignore[union-attr]
-    with_motion = calibration is not None and model in (name, "plane")
+    with_motion = model == "E" or (
+        calibration is not None and model == "plane" and "no common geometry" not in general.flags
+    )
     if model == name:
         flags, inliers = general.flags, general.inlier
         usable = usable and general.success
     elif model == "nothing" or plane is None:
         flags, inliers = ("no common geometry",), np.zeros(len(x1), np.bool_)
     else:
-        own = [flag for flag in plane.flags if flag != "no common geometry"]
+        told = {"no common geometry", *_MODELS}  # the model says what it is
+        own = [flag for flag in plane.flags if flag not in told]
         flags, inliers = ordered((*own, *_words(model))), plane.inlier
     return TwoViewResult(
         model=model,
@@ -214,11 +219,18 @@ def _words(model: Model) -> list[str]:
 def _message(model: Model, evidence: dict[str, dict[str, float]]) -> str:
     if model == "nothing":
         return "the matches agree no better than wrong ones do by chance"
-    ahead = evidence[model]["score"] if model in evidence else 0.0
+    # Without calibration a rotation is any homography
+    ahead = evidence[model if model in evidence else "plane"]["score"]
     return f"{model}: the logarithm of its likelihood is {ahead:.1f} above that of wrong matches"
 
 
-def _model(name: Model, general: RobustResult, plane: HomographyResult | None, flat: bool) -> Model:
+def _model(
+    name: Model,
+    general: RobustResult,
+    plane: HomographyResult | None,
+    flat: bool,
+    evidence: dict[str, dict[str, float]],
+) -> Model:
     """Return the model by the flags of both fits, and whether F explains no more than H."""
     if plane is None or "no common geometry" in plane.flags:
         return "nothing" if "no common geometry" in general.flags else name
@@ -226,6 +238,9 @@ def _model(name: Model, general: RobustResult, plane: HomographyResult | None, f
     if not flat and told.isdisjoint(general.flags):
         return name
     flags = {*general.flags, *plane.flags, "planar scene"}
+    # H may be that of a rotation with some calibration, but not with this one
+    if "rotation" in evidence and evidence["rotation"]["score"] < evidence["plane"]["score"]:
+        flags -= {"pure rotation"} - {*general.flags}
     return next(model for flag, model in _MODELS.items() if flag in flags)
 
 
