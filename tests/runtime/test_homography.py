@@ -135,6 +135,56 @@ class TestRefinement:
         assert np.median(right) < 1.5
         assert "gross errors" in eg.refine_homography(x1, x2).flags
 
+    def test_four_matches_say_nothing_of_the_noise(self) -> None:
+        x1, x2, _ = plane(2, m=4, noise=0.0)
+        for loss in ("linear", "cauchy"):
+            result = eg.refine_homography(x1, x2, loss=loss)
+            assert result.flags == ("weak geometry", "few matches")
+            assert np.isinf(result.noise_px)
+        known = eg.refine_homography(x1, x2, noise_px=0.1)
+        assert "still camera" not in known.flags
+        assert np.isfinite(known.covariance).all()
+
+    @pytest.mark.parametrize("m", [8, 60])
+    @pytest.mark.parametrize("loss", ["linear", "cauchy"])
+    def test_random_matches_are_not_said_to_agree(self, m: int, loss: Any) -> None:
+        for seed in range(3):
+            x1, x2 = np.random.default_rng(seed).uniform(0.0, 1000.0, (2, m, 2))
+            result = eg.refine_homography(x1, x2, loss=loss)
+            assert "no common geometry" in result.flags
+            assert "still camera" not in result.flags
+            assert not result.success
+
+    @pytest.mark.parametrize("noise", [0.5, 10.0])
+    def test_noise_is_no_lack_of_common_geometry(self, noise: float) -> None:
+        for m in (6, 20, 60):
+            x1, x2, _ = plane(30 + m, m=m, noise=noise)
+            S = np.eye(2) * noise**2
+            for options in ({}, {"covariance1": S, "covariance2": S}, {"weights": np.full(m, 9.0)}):
+                result = eg.refine_homography(x1, x2, **options)
+                assert "no common geometry" not in result.flags, (m, options)
+
+    @pytest.mark.parametrize("loss", ["linear", "cauchy"])
+    @pytest.mark.parametrize("backend", ["c", "numpy"])
+    def test_a_start_that_leads_nowhere_is_said(self, loss: Any, backend: Any) -> None:
+        x1, x2, _ = plane(5)
+        for H0 in (np.diag([1.0, 1.0, 0.0]), np.diag([1.0, 0.0, 0.0])):
+            result = eg.refine_homography(x1, x2, H0, loss=loss, backend=backend)
+            assert result.status < 0
+            assert not result.success
+            assert np.isfinite(result.points1).all()
+
+    def test_matches_almost_on_a_line_have_a_start(self) -> None:
+        # The algebraic fit sends one of them to infinity.
+        for seed in (5, 12, 20, 21, 22):
+            rng = np.random.default_rng(seed)
+            line = np.column_stack([np.linspace(0.0, 900.0, 60), np.linspace(3.0, 1803.0, 60)])
+            H = np.array([[1.0, 0.1, 20.0], [-0.1, 1.0, 5.0], [1e-4, 0.0, 1.0]])
+            x1, x2 = (x + 0.01 * rng.standard_normal((60, 2)) for x in (line, mapped(H, line)))
+            result = eg.refine_homography(x1, x2)
+            assert np.isfinite(result.points1).all()
+            assert result.status > 0
+
     def test_bad_input_is_refused(self) -> None:
         x1, x2, _ = plane(10)
         with pytest.raises(eg.ArgumentError, match="at least 4"):
@@ -188,3 +238,27 @@ class TestRawMatches:
         x1, x2, _ = plane(12, 50)
         first, second = (eg.estimate_homography(x1, x2, seed=4) for _ in range(2))
         assert np.array_equal(first.H, second.H)
+
+    def test_a_wide_threshold_is_no_chance(self) -> None:
+        x1, x2, _ = plane(6)
+        assert eg.estimate_homography(x1, x2, threshold_px=1e6).success
+
+    def test_ragged_options_are_refused(self) -> None:
+        x1, x2, _ = plane(7)
+        for name in ("weights", "covariance1"):
+            for estimate in (eg.estimate_homography, eg.estimate_fundamental):
+                with pytest.raises(eg.ArgumentError, match=name):
+                    estimate(x1, x2, **{name: [[1.0], [1.0, 2.0]]})  # type: ignore[operator]
+
+    @pytest.mark.parametrize("estimate", [eg.estimate_homography, eg.estimate_fundamental])
+    def test_matches_to_one_place_do_not_agree(self, estimate: Any) -> None:
+        def verdict(seed: int) -> str:
+            x1, x2, _ = plane(seed)
+            x2[:50] = x2[0]
+            try:
+                return "usable" if estimate(x1, x2).success else "not usable"
+            except eg.ArgumentError as error:
+                return str(error)
+
+        told = [verdict(seed) for seed in (0, 1, 2, 8)]
+        assert all(one == "not usable" or "that agree" in one for one in told), told

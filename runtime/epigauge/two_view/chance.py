@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.kernels import Table
+from epigauge.two_view.homography import plane_squares
 
 __all__ = [
     "CEILING",
@@ -31,6 +32,7 @@ __all__ = [
     "RANK",
     "SIGNIFICANT",
     "chance_agreement",
+    "chance_on_plane",
     "independent",
     "log10_false_alarms",
 ]
@@ -104,22 +106,37 @@ def chance_agreement(table: Table, F: Array, q1: Array, q2: Array, limit: float)
     float
         Where few wrong pairs are so near, from the density of the distance further out.
     """
-    m = q1.shape[1]
-    rounds = min(-(-PAIRS // m), m - 1)
-    shifts = [1 + k * (m - 2) // max(rounds - 1, 1) for k in range(rounds)]
     with np.errstate(all="ignore"):  # a point on an epipole
         distances = np.concatenate(
             [
                 np.abs(table.sampson(F, q1, np.ascontiguousarray(np.roll(q2, shift, axis=1)))[0][0])
-                for shift in shifts
+                for shift in _shifts(q1.shape[1])
             ]
         )
-    near = int(np.count_nonzero(distances <= limit))
-    if near >= RANK or near == len(distances):
-        return near / len(distances)
-    rank = min(RANK, len(distances)) - 1
-    wide = float(np.partition(distances, rank)[rank])
-    return (rank + 1) / len(distances) * min(limit / wide, 1.0) if wide > 0.0 else 1.0
+    return _share_within(distances, limit)
+
+
+def chance_on_plane(table: Table, H: Array, q1: Array, q2: Array, limit: float) -> float:
+    """Return the same of a homography: the density grows as the square of the distance."""
+    rolled = (np.ascontiguousarray(np.roll(q2, shift, axis=1)) for shift in _shifts(q1.shape[1]))
+    squared = np.concatenate([plane_squares(table, H, q1, one) for one in rolled])
+    return _share_within(squared, limit**2)
+
+
+def _shifts(m: int) -> list[int]:
+    """Return by how much to shift one image's points against the other's for wrong pairs."""
+    rounds = min(-(-PAIRS // m), m - 1)
+    return [1 + k * (m - 2) // max(rounds - 1, 1) for k in range(rounds)]
+
+
+def _share_within(values: Array, bound: float) -> float:
+    """Return the share of values up to a bound; where few are, from their density further out."""
+    near = int(np.count_nonzero(values <= bound))
+    if near >= RANK or near == len(values):
+        return near / len(values)
+    rank = min(RANK, len(values)) - 1
+    wide = float(np.partition(values, rank)[rank])
+    return (rank + 1) / len(values) * min(bound / wide, 1.0) if wide > 0.0 else 1.0
 
 
 def independent(q1: Array, q2: Array) -> int:

@@ -9,7 +9,7 @@ from epigauge import kernels
 from epigauge.kernels import Table
 from epigauge.two_view.losses import median
 
-__all__ = ["fit_homography", "robust_homography"]
+__all__ = ["fit_homography", "plane_squares", "robust_homography"]
 
 Array = NDArray[np.float64]
 
@@ -61,6 +61,13 @@ def fit_homography(
     for _ in range(4):  # converges as the noise over the size of the scene
         H, N = _least(table, H, q1, q2, weights)
     return H, table.homography_squared(H, q1, q2), N
+
+
+def plane_squares(table: Table, H: Array, q1: Array, q2: Array) -> Array:
+    """Return squared distances to first order; infinite where there are none."""
+    with np.errstate(all="ignore"):
+        squared = table.homography_squared(H, q1, q2)
+    return np.asarray(np.where(np.isfinite(squared), squared, np.inf))
 
 
 def robust_homography(

@@ -39,7 +39,7 @@ class Transfer:
     H : ndarray, shape (3, 3)
         Of unit norm.
     foot : ndarray, shape (2, m)
-        Corrected points of image 1.
+        Corrected points of image 1; as they are for a match that H takes to nowhere.
     squared : ndarray, shape (m,)
         Squared distances; infinite for a match that H takes to nowhere.
     cost : float
@@ -95,7 +95,8 @@ class HomographyProblem:
         """Return foot points and cost."""
         with np.errstate(all="ignore"):  # a match that H takes to infinity
             foot, squared = self.kernels.homography_foot(H, self.q1, self.q2, self.S1, self.S2)
-            squared = np.where(np.isfinite(squared), squared, np.inf)
+            nowhere = ~np.isfinite(squared)
+            squared[nowhere], foot[:, nowhere] = np.inf, self.q1[:, nowhere]
             values = np.where(self.weights > 0.0, self.loss(squared)[0], 0.0)
             cost = 0.5 * float(self.weights @ values)
         return Transfer(H, foot, squared, cost if np.isfinite(cost) else np.inf)
@@ -114,7 +115,10 @@ class HomographyProblem:
         some = [self.q1, self.q2, self.S1, self.S2, state.foot]
         if not use.all():
             some, weights = [np.ascontiguousarray(a[:, use]) for a in some], weights[use]
-        packed, gradient = self.kernels.homography_system(state.H, *some, weights)
+        with np.errstate(all="ignore"):
+            packed, gradient = self.kernels.homography_system(state.H, *some, weights)
+        if not (np.isfinite(packed).all() and np.isfinite(gradient).all()):
+            return np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)  # H is singular there
         N = np.zeros((9, 9))
         N[_UPPER] = packed
         N.T[_UPPER] = packed

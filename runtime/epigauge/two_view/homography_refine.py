@@ -24,17 +24,19 @@ from epigauge._options import Backend
 from epigauge._options import Loss as LossName
 from epigauge.errors import ArgumentError
 from epigauge.linear import Levenberg
+from epigauge.two_view.chance import SIGNIFICANT, chance_on_plane, log10_false_alarms
 from epigauge.two_view.conditioning import Conditioning, condition
+from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.copies import counted_once
 from epigauge.two_view.diagnostics import PIXELS, REDUNDANCY, WEAK, still_bound
 from epigauge.two_view.evidence import ROUNDING
-from epigauge.two_view.homography import fit_homography, robust_homography
+from epigauge.two_view.homography import fit_homography, plane_squares, robust_homography
 from epigauge.two_view.homography_problem import PARAMETERS, HomographyProblem, Transfer, across
 from epigauge.two_view.homography_result import HomographyResult
 from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, median
 from epigauge.two_view.planes import rotation_within
 from epigauge.two_view.solve import joined
-from epigauge.two_view.suspicion import TAIL, TAIL_SHARE
+from epigauge.two_view.suspicion import TAIL, TAIL_SHARE, WIDE
 from epigauge.verdicts import ordered, usable
 
 __all__ = ["deviation_of_median", "refine_homography"]
@@ -47,6 +49,9 @@ LEAST = 4
 
 #: Rounds in which the scale of a robust loss is estimated, and the change at which it stands.
 _ROUNDS, _STANDS = 10, 1e-3
+
+#: Distance that 99.9 % of right matches are within, in standard deviations of a coordinate.
+_KEPT = math.sqrt(2.0 * math.log(1000.0))
 
 
 @logged
@@ -139,6 +144,8 @@ def refine_homography(
         S = (_packed(C1), _packed(C2))
     H = _start(H0, frame, q1, q2, w, table, name)
     problem = HomographyProblem(table, q1, q2, w, Loss(), S)
+    if H0 is None and not math.isfinite(problem.evaluate(H).cost):
+        H = _affine(q1, q2, w)  # which takes no match to infinity
     found = _minimized(problem, name, given_scale, frame.scale, H, stopping, callback)
     return _assembled(found, problem.with_loss(found.loss), frame, noise_px)
 
@@ -181,6 +188,14 @@ def _start(
     return robust_homography(*some, w[counts], table)[0]
 
 
+def _affine(q1: Array, q2: Array, w: Array) -> Array:
+    """Return the affine map of least squares in image 2, of unit norm."""
+    root = np.sqrt(w / np.max(w))[:, None]
+    A = np.column_stack([*q1, np.ones(q1.shape[1])])
+    H = np.vstack([np.linalg.lstsq(A * root, q2.T * root, rcond=None)[0].T, [0.0, 0.0, 1.0]])
+    return np.asarray(H / np.linalg.norm(H))
+
+
 def _minimized(
     problem: HomographyProblem,
     name: str,
@@ -211,7 +226,9 @@ def _minimized(
             squared = (problem.weights * problem.evaluate(H).squared)[counts]
             scale = EFFICIENT[name] * max(deviation_of_median(squared), 1e-12)
             loss = Loss(name, scale)
-            if abs(scale - last) <= _STANDS * scale:
+            if not math.isfinite(scale):  # H takes most matches to nowhere: no cost to begin with
+                loss = Loss()
+            elif abs(scale - last) <= _STANDS * scale:
                 break
         outcome = run(loss, H)
         H, nfev, njev = outcome.state.H, nfev + outcome.nfev, njev + outcome.njev
@@ -242,18 +259,18 @@ def _assembled(
     N, _ = problem.system(state, weights)
     factor = 1.0
     if loss.name == "linear":
-        noise = math.sqrt(float(np.sum(squared)) / redundancy) if redundancy > 0 else math.inf
-        known = noise
+        known = math.sqrt(float(np.sum(squared)) / redundancy) if redundancy > 0 else math.inf
     else:
-        noise = known = deviation_of_median(squared)
+        known = deviation_of_median(squared) if redundancy > 0 else math.inf
         _, first, second = loss(state.squared[counts])
         finite = np.isfinite(squared)
         power = np.mean(np.where(finite, first**2 * squared, 0.0))
         slope = np.mean(np.where(finite, first + second * squared, 0.0))
-        if known > 0.0 and slope > 0.0:
+        if 0.0 < known < math.inf and slope > 0.0:
             factor = float(power / (2.0 * known**2 * slope**2)) * n / max(n - 4, 1)
-    if noise_px is not None:
-        noise = noise_px / scale
+    noise = known if noise_px is None else noise_px / scale
+    if redundancy <= 0:
+        known = noise
     values, vectors = np.linalg.eigh(N)
     determined = values > 1e-14 * max(float(values[-1]), np.finfo(float).tiny)
     rank = int(np.count_nonzero(determined))
@@ -280,7 +297,9 @@ def _assembled(
         rank=rank,
         condition=float(np.sqrt(values[-1] / values[0])) if rank == PARAMETERS else math.inf,
         noise_px=noise * scale,
-        rms_px=math.sqrt(float(np.mean(state.squared[counts][finite])) / 4.0) * scale,
+        rms_px=math.sqrt(float(np.mean(state.squared[counts][finite])) / 4.0) * scale
+        if finite.any()
+        else math.inf,
         loss_scale_px=0.0 if loss.name == "linear" else loss.scale * scale,
         inlier=counts,
         used=np.arange(len(weights)),
@@ -313,17 +332,30 @@ def _flags(
 ) -> tuple[str, ...]:
     """Return what can be the matter with a homography of matches that are said to be right."""
     counts = problem.weights > 0.0
-    q1, q2, weights = problem.q1[:, counts], problem.q2[:, counts], problem.weights[counts]
+    q1, q2 = (np.ascontiguousarray(q[:, counts]) for q in (problem.q1, problem.q2))
+    weights = problem.weights[counts]
     squared = weights * state.squared[counts]
     n = len(weights)
-    noise2 = max(noise, ROUNDING) ** 2
     told = {"few matches": 2 * n - PARAMETERS < REDUNDANCY, "weak geometry": deviation > WEAK}
     told["not pixels"] = (
         max(float(np.max(np.ptp(q, axis=1))) for q in (q1, q2)) < PIXELS * to1[0, 0]
     )
+    if not math.isfinite(noise):  # four matches, or a run that did not begin: nothing to judge by
+        return ordered(name for name, raised in told.items() if raised)
+    few, noise2 = told["few matches"] and n > LEAST, max(noise, ROUNDING) ** 2
     tail = (TAIL * deviation_of_median(squared)) ** 2
     if problem.loss.name == "linear" and noise > ROUNDING:
         told["gross errors"] = bool(np.sum(squared[squared > tail]) > TAIL_SHARE * np.sum(squared))
+    # As for F: what is said to be right is doubted where the noise is large, or hardly known.
+    near = squared <= _KEPT**2 * noise2
+    plain = plane_squares(problem.kernels, state.H, q1, q2)[near]
+    wide = not math.sqrt(float(np.mean(plain)) / 2.0) <= WIDE * RANGE if near.any() else True
+    if wide or few:
+        chance = chance_on_plane(problem.kernels, state.H, q1, q2, math.sqrt(np.max(plain)))
+        alarms = log10_false_alarms(n, len(plain), chance, LEAST)
+        if alarms > (0.0 if few else SIGNIFICANT):
+            told["no common geometry"] = True
+            return ordered(name for name, raised in told.items() if raised)
     moved = q2 - q1 - (to2[:2, 2] - to1[:2, 2])[:, None]
     more = float(weights @ np.sum(moved**2, axis=0)) / 2.0 - float(np.sum(squared))
     told["still camera"] = more <= still_bound(n, 2 * n - PARAMETERS) * noise2

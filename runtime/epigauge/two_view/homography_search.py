@@ -19,17 +19,18 @@ from epigauge._arguments import as_count, as_matches, as_positive, as_score
 from epigauge._logged import logged
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
-from epigauge.two_view.chance import CEILING, PAIRS, RANK, SIGNIFICANT, log10_false_alarms
+from epigauge.two_view.chance import CEILING, SIGNIFICANT, chance_on_plane, log10_false_alarms
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.copies import earliest
 from epigauge.two_view.evidence import ROUNDING
-from epigauge.two_view.homography import fit_homography
+from epigauge.two_view.homography import fit_homography, plane_squares
 from epigauge.two_view.homography_refine import LEAST, refine_homography, with_flags
 from epigauge.two_view.homography_result import HomographyResult
+from epigauge.two_view.robust import of_matches
 from epigauge.two_view.search import SCALES, ranked
 
-__all__ = ["PlaneMixture", "chance_on_plane", "estimate_homography"]
+__all__ = ["PlaneMixture", "estimate_homography"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -172,11 +173,11 @@ def estimate_homography(
     if promise is not None:
         order = np.argsort(-promise[rows], kind="stable")
     H = _searched(table, q1, q2, order, np.random.default_rng(seed))
-    mixture = PlaneMixture.of(_squares(table, H, q1, q2), SCALES[0])
+    mixture = PlaneMixture.of(plane_squares(table, H, q1, q2), SCALES[0])
     result, limit = None, 0.0
     tried: set[bytes] = set()
     for _ in range(_ROUNDS):
-        squared = _squares(table, H, q1, q2)
+        squared = plane_squares(table, H, q1, q2)
         mixture = PlaneMixture.of(squared, mixture.sigma)
         limit = min(mixture.even, _DEVIATIONS * mixture.sigma, CEILING * RANGE)
         limit = max(limit, ROUNDING) if threshold is None else threshold / frame.scale
@@ -187,11 +188,11 @@ def estimate_homography(
         if inlier.tobytes() in tried:
             break
         tried.add(inlier.tobytes())
-        chosen = _of_matches(options, len(x1), rows[inlier])
+        chosen = of_matches(options, len(x1), rows[inlier])
         try:
             result = refine_homography(y1[inlier], y2[inlier], frame_to_pixels(frame, H), **chosen)
         except ArgumentError as error:
-            if error.argument not in ("x1", "x2") or result is not None:
+            if error.argument not in ("x1", "x2"):
                 raise
             raise ArgumentError(
                 error.argument, "has all points that agree on one line", "spread matches"
@@ -201,9 +202,10 @@ def estimate_homography(
         H = to2 @ result.H @ np.linalg.inv(to1)
         H /= np.linalg.norm(H)
     assert result is not None
-    alarms = log10_false_alarms(
-        len(rows), int(np.count_nonzero(used)), chance_on_plane(table, H, q1, q2, limit), LEAST
-    )
+    bound = min(limit, CEILING * RANGE)  # within more, wrong matches agree, too
+    agreed = int(np.count_nonzero(plane_squares(table, H, q1, q2)[used] <= bound**2))
+    chance = chance_on_plane(table, H, q1, q2, bound)
+    alarms = log10_false_alarms(len(rows), agreed, chance, LEAST)
     flags = ("no common geometry",) if alarms > SIGNIFICANT else ()
     if threshold is None and options.get("noise_px") is None and np.isfinite(result.noise_px):
         tails = 1.0 / math.sqrt(_KEPT)  # the threshold has cut them off
@@ -218,23 +220,6 @@ def frame_to_pixels(frame: Any, H: Array) -> Array:
     """Return a conditioned homography in pixels."""
     to1, to2 = frame.maps_from_pixels()
     return np.asarray(np.linalg.inv(to2) @ H @ to1)
-
-
-def _of_matches(options: dict[str, Any], m: int, rows: NDArray[np.intp]) -> dict[str, Any]:
-    """Return the options with those that have one entry a match restricted to some."""
-    chosen = dict(options)
-    for name, dimensions in (("weights", 1), ("covariance1", 3), ("covariance2", 3)):
-        value = np.asarray(options.get(name))
-        if value.ndim == dimensions and len(value) == m:
-            chosen[name] = value[rows]
-    return chosen
-
-
-def _squares(table: Table, H: Array, q1: Array, q2: Array) -> Array:
-    """Return squared distances to first order; infinite where there are none."""
-    with np.errstate(all="ignore"):
-        squared = table.homography_squared(H, q1, q2)
-    return np.asarray(np.where(np.isfinite(squared), squared, np.inf))
 
 
 def _agreement(squared: Array) -> float:
@@ -266,14 +251,14 @@ def _searched(
         done += _BATCH
         if not len(candidates):
             continue
-        first = np.array([_agreement(_squares(table, one, j1, j2)) for one in candidates])
+        first = np.array([_agreement(plane_squares(table, one, j1, j2)) for one in candidates])
         finalists = candidates[np.argsort(-first, kind="stable")[:_FINALISTS]]
-        scores = [_agreement(_squares(table, one, q1, q2)) for one in finalists]
+        scores = [_agreement(plane_squares(table, one, q1, q2)) for one in finalists]
         if max(scores) <= highest:
             continue
         highest = max(scores)
         best, fitted = _improved(table, finalists[int(np.argmax(scores))], q1, q2, best)
-        near = np.count_nonzero(_squares(table, best, q1, q2) <= (3.0 * SCALES[0]) ** 2)
+        near = np.count_nonzero(plane_squares(table, best, q1, q2) <= (3.0 * SCALES[0]) ** 2)
         needed = min(max(_PATIENCE * (m / max(near, 4.0)) ** 4, _LEAST), _MOST)
         highest = max(highest, fitted)
     return np.asarray(best)
@@ -283,29 +268,10 @@ def _improved(table: Table, H: Array, q1: Array, q2: Array, before: Array) -> tu
     """Fit to the matches around, wide first and then narrow; return the best, and its score."""
     found = [before, H]
     for width in SCALES[0] * np.array(_WIDTHS):
-        weights = np.exp(-0.5 * np.minimum(_squares(table, H, q1, q2) / width**2, 100.0))
+        weights = np.exp(-0.5 * np.minimum(plane_squares(table, H, q1, q2) / width**2, 100.0))
         if np.count_nonzero(weights > 0.1) < LEAST:
             break
         H = fit_homography(q1, q2, weights, table)[0]
         found.append(H)
-    scores = [_agreement(_squares(table, one, q1, q2)) for one in found]
+    scores = [_agreement(plane_squares(table, one, q1, q2)) for one in found]
     return np.asarray(found[int(np.argmax(scores))]), max(scores)
-
-
-def chance_on_plane(table: Table, H: Array, q1: Array, q2: Array, limit: float) -> float:
-    """Return the probability that a wrong match is within a distance of a homography.
-
-    Wrong matches are made of the points themselves, as for F. Where few wrong pairs are so near,
-    the density further out tells, which grows as the square of the distance.
-    """
-    m = q1.shape[1]
-    rounds = min(-(-PAIRS // m), m - 1)
-    shifts = [1 + k * (m - 2) // max(rounds - 1, 1) for k in range(rounds)]
-    rolled = (np.ascontiguousarray(np.roll(q2, shift, axis=1)) for shift in shifts)
-    squared = np.concatenate([_squares(table, H, q1, one) for one in rolled])
-    near = int(np.count_nonzero(squared <= limit**2))
-    if near >= RANK or near == len(squared):
-        return near / len(squared)
-    rank = min(RANK, len(squared)) - 1
-    wide = float(np.partition(squared, rank)[rank])
-    return (rank + 1) / len(squared) * min(limit**2 / wide, 1.0) if wide > 0.0 else 1.0

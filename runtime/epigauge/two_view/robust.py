@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
-from epigauge._arguments import as_count, as_matches, as_positive, as_score
+from epigauge._arguments import as_array, as_count, as_matches, as_positive, as_score
 from epigauge._logged import logged
 from epigauge._options import FrontEnd, RefineOptions, known_options
 from epigauge.errors import ArgumentError
@@ -25,7 +25,7 @@ from epigauge.two_view.losses import robust_scale
 from epigauge.two_view.refine import calibrations, refine_fundamental
 from epigauge.two_view.result import FundamentalResult
 
-__all__ = ["Estimate", "RobustResult", "estimate_fundamental", "estimated"]
+__all__ = ["Estimate", "RobustResult", "estimate_fundamental", "estimated", "of_matches"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -210,9 +210,15 @@ def estimated(
     while inlier.tobytes() not in fitted and len(fitted) < _ROUNDS:
         fitted.add(inlier.tobytes())
         used, limit_px = inlier, limit * frame.scale
-        chosen = _of_matches(options, len(x1), rows[used])
+        chosen = of_matches(options, len(x1), rows[used])
         F0 = frame.to_pixels(agreement.F)
-        refined = refine_fundamental(y1[used], y2[used], F0, **chosen)
+        try:
+            refined = refine_fundamental(y1[used], y2[used], F0, **chosen)
+        except ArgumentError as error:
+            if error.argument not in ("x1", "x2"):
+                raise
+            where = "has all points that agree in one place or on one line"
+            raise ArgumentError(error.argument, where, "spread matches") from None
         F = frame.from_pixels(refined.F)
         signed, oriented = consensus.measured(F)
         agreement = replace(agreement, F=F, signed=signed, oriented=oriented)
@@ -228,7 +234,7 @@ def estimated(
         "rounds": len(fitted),
         "start": name,
     }
-    weights = _of_matches(options, len(x1), rows).get("weights")
+    weights = of_matches(options, len(x1), rows).get("weights")
     raw = _Raw(y1, y2, np.ones(len(y1)) if weights is None else np.asarray(weights, float))
 
     def judged() -> SimpleNamespace:
@@ -308,11 +314,13 @@ def _at_most(limit: float) -> float:
     return float(min(limit, WIDEST * RANGE))
 
 
-def _of_matches(options: dict[str, Any], m: int, rows: NDArray[np.intp]) -> dict[str, Any]:
+def of_matches(options: dict[str, Any], m: int, rows: NDArray[np.intp]) -> dict[str, Any]:
     """Return the options with those that have one entry a match restricted to some."""
     chosen = dict(options)
     for name, dimensions in _PER_MATCH.items():
-        value = np.asarray(options.get(name))
+        if options.get(name) is None:
+            continue
+        value = as_array(name, options[name], "an array with a row a match")
         if value.ndim == dimensions and len(value) == m:
             chosen[name] = value[rows]
     return chosen
