@@ -227,6 +227,11 @@ class TestRefusals:
         with pytest.raises(ArgumentError, match=named):
             eg.bundle_adjust(tracks, start, **options)
 
+    @pytest.mark.parametrize("other", [None, "parts", np.zeros((4, 2))])
+    def test_what_are_no_tracks_is_named(self, start: eg.Reconstruction, other: Any) -> None:
+        with pytest.raises(ArgumentError, match=f"tracks is a {type(other).__name__}"):
+            eg.bundle_adjust(other, start)
+
     def test_a_start_of_another_size(self, tracks: eg.Tracks, start: eg.Reconstruction) -> None:
         with pytest.raises(ArgumentError, match="has 4 cameras and 100 points"):
             eg.bundle_adjust(tracks, eg.Reconstruction(start.P[:-1], start.Q))

@@ -187,6 +187,8 @@ def bundle_adjust(
     >>> tracks, scene = eg.load_scene("sparse/0")  # doctest: +SKIP
     >>> eg.bundle_adjust(tracks, scene, refine=("f", "k"), fixed_views=[0])  # doctest: +SKIP
     """
+    if not isinstance(tracks, Tracks):
+        raise ArgumentError("tracks", f"is a {type(tracks).__name__}", "eg.Tracks(...)")
     fixed_views, fixed_points = tuple(fixed_views), tuple(fixed_points)
     priors = None if priors is None else listed_priors(priors)
     if noise_px != "tracks" and not priors:
