@@ -325,3 +325,9 @@ def test_a_start_that_is_none_and_odd_numbers_of_lines_are_named(scene):
 def test_text_tells_of_lines(scene):
     assert "60 points, 60 lines, Cameras" in repr(scene.true)
     assert "lines" not in repr(dataclasses.replace(scene.true, lines=None))
+
+
+def test_a_scene_of_no_line_is_one_without_lines(tmp_path, scene):
+    empty = dataclasses.replace(scene.true, lines=np.zeros((0, 6)))
+    assert empty.lines is None
+    eg.save_scene(tmp_path / "folder", scene.tracks, empty)

@@ -42,7 +42,7 @@ class MetricReconstruction(ReconstructionBase):
         Their model and parameters.
     lines : array_like, shape (L, 6), optional
         Lines as Pluecker coordinates (n, v), v the direction and n = X x v for every point X of the
-        line; they are stored with a unit vector v.
+        line; they are stored with a unit vector v, and as None where there is no line.
 
     Raises
     ------
@@ -77,7 +77,8 @@ class MetricReconstruction(ReconstructionBase):
         for name, array in (("R", R), ("t", t), ("X", X)):
             object.__setattr__(self, name, frozen(array))
         if self.lines is not None:
-            object.__setattr__(self, "lines", frozen(_checked_lines(self.lines)))
+            lines = _checked_lines(self.lines)
+            object.__setattr__(self, "lines", frozen(lines) if len(lines) else None)
 
     @property
     def n_views(self) -> int:
