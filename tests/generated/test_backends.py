@@ -45,7 +45,7 @@ def pool(values, batch, rng):
 
 def definite(batch, rng, entries):
     """Return upper triangles, of so many entries, of positive definite matrices."""
-    rows = {6: 3, 10: 4}[entries]
+    rows = {3: 2, 6: 3, 10: 4}[entries]
     root = rng.standard_normal((*batch, rows, rows + 2))
     upper = (root @ root.swapaxes(-1, -2))[..., *np.triu_indices(rows)]
     return np.moveaxis(upper, -1, 0)
@@ -91,6 +91,8 @@ def inputs(name, batch, seed, F=None):
         "damping": lambda: np.array([0.3, 0.2, 0.5, 0.4]),
         "N": lambda: definite(batch, rng, shapes["N"][0]),
         "W": lambda: definite(batch, rng, shapes["W"][0]),
+        **{side: lambda: definite(batch, rng, 3) for side in ("S1", "S2")},
+        "spread": lambda: np.concatenate([definite(batch, rng, 3) for _ in range(2)]),
         "lam": lambda: rng.uniform(0.0, 1.0, batch if lam_each else ()),
     }
     wanted = set(shapes)

@@ -618,6 +618,8 @@ def test_every_derivative_is_checked_here():
     derived -= {name for name, s in SIGNATURES.items() if s.family == "minimal"}
     # The same of homographies: test_homography.py.
     derived -= {name for name, s in SIGNATURES.items() if s.family == "homography"}
+    # Updates, images and residuals of lines: test_lines.py.
+    derived -= {name for name, s in SIGNATURES.items() if s.family == "lines"}
     # Camera models: test_cameras.py.
     derived -= {name for name, s in SIGNATURES.items() if s.family.startswith("cameras_")}
     # A kernel of one F each is compared with the one of a shared F in test_backends.py.

@@ -44,7 +44,7 @@ def test_checkers_know_the_names_that_solvers_know(name: str) -> None:
     [
         ("RefineOptions", eg.refine_fundamental, {"x1", "x2", "F0"}),
         ("PairOptions", eg.refine_fundamental, {"x1", "x2", "F0", "weights"}),
-        ("AdjustOptions", eg.bundle_adjust, {"tracks", "start", "method"}),
+        ("AdjustOptions", eg.bundle_adjust, {"tracks", "start", "method", "lines"}),
     ],
 )
 def test_options_that_are_passed_on_are_all_there_are(

@@ -43,6 +43,10 @@ VIEW, POINT, XY = MANY.tracks.view.copy(), MANY.tracks.point.copy(), pixels(MANY
 START = eg.initialize(eg.Tracks(VIEW, POINT, XY))
 P, Q = short(START.P), short(START.Q)
 K = np.array([[1000.0, 0.0, 600.0], [0.0, 1000.0, 600.0], [0.0, 0.0, 1.0]])
+#: X1 through a homography: matches in a plane.
+H = np.array([[1.0, 0.125, 8.0], [-0.0625, 1.0, 4.0], [0.0, 0.0, 1.0]])
+PLANE = {"x1": (X1, "px"), "x2": (np.round(X1 @ H[:2, :2].T + H[:2, 2]), "px")}
+LINES = eg.line_scene(n_views=4, n_points=10, n_lines=6)
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,10 @@ def covariance(tracks: eg.Tracks, start: eg.Reconstruction) -> Any:
     return found.cameras, found.points, found.projections
 
 
+def triangulate_lines(view: Any, line: Any, segments: Any) -> Any:
+    return eg.triangulate_lines(eg.LineTracks(view, line, segments), LINES.true)
+
+
 def transform(P: Any, Q: Any, T: Any, a: Any, b: Any) -> Any:
     return eg.gauge.transform(eg.Reconstruction(P, Q), T, a, b)
 
@@ -98,7 +106,14 @@ ROWS = {
     "canonical_cameras": Row(eg.canonical_cameras, _F),
     "compare": Row(from_start(eg.compare, methods=["covariant", "free"]), _TRACKS | _START),
     "covariance": Row(from_start(covariance), _TRACKS | _START),
-    "estimate_fundamental": Row(eg.estimate_fundamental, _MATCHES, "cv2"),
+    "estimate_essential": Row(eg.estimate_essential, _MATCHES | {"K1": (K, "px"), "K2": (K, "px")}),
+    "estimate_fundamental": Row(eg.estimate_fundamental, _MATCHES),
+    "estimate_fundamental_batch": Row(
+        eg.estimate_fundamental_batch,
+        _MATCHES | _WEIGHTS | {"offsets": (np.array([0, 30]), "index")},
+    ),
+    "estimate_homography": Row(eg.estimate_homography, PLANE),
+    "estimate_two_view": Row(eg.estimate_two_view, PLANE | {"K1": (K, "px"), "K2": (K, "px")}),
     "fundamental_7point": Row(eg.fundamental_7point, {"x1": (X1[:7], "px"), "x2": (X2[:7], "px")}),
     "fundamental_8point": Row(eg.fundamental_8point, _MATCHES),
     "gauge.equivalent": Row(lambda **k: eg.gauge.equivalent(eg.Reconstruction(**k), START), _START),
@@ -145,6 +160,7 @@ ROWS = {
         lambda **k: eg.refine_fundamental(essential=True, **k),
         _MATCHES | {"K1": (K, "px"), "K2": (K, "px")},
     ),
+    "refine_homography": Row(eg.refine_homography, PLANE | _WEIGHTS | {"H0": (H, "real")}),
     "refine_fundamental_batch": Row(
         eg.refine_fundamental_batch,
         {
@@ -157,6 +173,14 @@ ROWS = {
     ),
     "reprojection_distances": Row(eg.reprojection_distances, _F | _MATCHES),
     "sampson_distances": Row(eg.sampson_distances, _F | _MATCHES),
+    "triangulate_lines": Row(
+        triangulate_lines,
+        {
+            "view": (LINES.line_tracks.view.copy(), "index"),
+            "line": (LINES.line_tracks.line.copy(), "index"),
+            "segments": (short(LINES.line_tracks.segments), "real"),
+        },
+    ),
     "triangulate": Row(eg.triangulate, {"P": (P[:2], "real"), "x": (np.stack([X1, X2]), "px")}),
 }
 
@@ -173,7 +197,7 @@ NO_ARRAYS = {
     "save_scene": "writes what has been checked",
     "gauge.group": "takes a name",
     "gauge.similarity": "refused forms are tested with the scenes that it moves",
-    **dict.fromkeys(("multi_view_scene", "two_view_scene"), "takes numbers"),
+    **dict.fromkeys(("line_scene", "multi_view_scene", "two_view_scene"), "takes numbers"),
     **dict.fromkeys(("interop.bal_to_colmap", "interop.colmap_to_bal"), "takes a reconstruction"),
     "interop.from_opencv": "takes objects of OpenCV",
     "interop.from_poselib": "takes objects of PoseLib",

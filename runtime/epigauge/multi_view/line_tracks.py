@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epigauge._arguments import MAX_PX, as_count, as_real
+from epigauge._arguments import MAX_PX, as_array, as_count, as_real
 from epigauge._results import Result
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.labels import view_names
@@ -141,7 +141,7 @@ class LineTracks(Result):
 
 
 def _indices(name: str, value: ArrayLike) -> Indices:
-    array = np.asarray(value)
+    array = as_array(name, value, "integers (N,)")
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
         raise ArgumentError(name, f"is {array.dtype} {array.shape}", "integers (N,)")
     if array.size and array.min() < 0:
