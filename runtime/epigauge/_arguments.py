@@ -239,6 +239,9 @@ def as_calibration(name: str, K: ArrayLike) -> Array:
         raise ArgumentError(
             name, f"has an entry of {np.abs(scaled).max():g}", f"pixels, up to {MAX_PX:g}"
         )
+    if not np.diag(scaled).min() >= MIN_PX:
+        was = f"has a focal length of {np.diag(scaled).min():g}"
+        raise ArgumentError(name, was, f"pixels, at least {MIN_PX:g}")
     return scaled
 
 

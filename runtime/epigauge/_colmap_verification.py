@@ -375,8 +375,13 @@ def _essential(pair: RawPair, result: RobustResult) -> tuple[Array, Array, Mask]
     if pair.K1 is None or pair.K2 is None:
         return None
     x1, x2 = pair.x1[result.used], pair.x2[result.used]
-    found = refine_fundamental(x1, x2, result.F, essential=True, K1=pair.K1, K2=pair.K2)
-    distances = reprojection_distances(found.F, pair.x1, pair.x2)[0]
+    try:
+        found = refine_fundamental(x1, x2, result.F, essential=True, K1=pair.K1, K2=pair.K2)
+        distances = reprojection_distances(found.F, pair.x1, pair.x2)[0]
+    except (
+        ArgumentError
+    ):  # points so far off for these cameras that F has rank 1 in double precision
+        return None
     inlier = result.inlier & (np.abs(distances) <= result.threshold_px)
     if np.count_nonzero(inlier) < _BY_E * np.count_nonzero(result.inlier):
         return None

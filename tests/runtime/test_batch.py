@@ -97,6 +97,7 @@ def test_an_empty_batch_is_legal():
         ({"offsets": [0.0, 93.0]}, "offsets"),
         ({"F0": np.eye(3)}, "F0"),
         ({"criterion": "samson"}, "criterion"),
+        ({"covariance2": np.tile(np.eye(2), (93, 1, 1))}, "covariance2 is one a match"),
         ({"workers": 0}, "workers"),
     ],
 )

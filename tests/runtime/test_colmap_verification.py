@@ -161,6 +161,15 @@ def test_an_unknown_lens_is_flagged_and_not_stored(tmp_path) -> None:
     assert len(content(path)["two_view_geometries"]) == 1
 
 
+@pytest.mark.parametrize(("size", "f"), [(1e30, F), (1.0, 1e-300)], ids=["points", "focal length"])
+def test_cameras_that_are_far_from_their_points_spoil_their_pair_only(tmp_path, size, f) -> None:
+    pairs = [matches("general", 1), matches("general", 4)]
+    pairs[0] = tuple(size * x for x in pairs[0])
+    path = database(tmp_path / "d.db", pairs, params=[f, 600.0, 450.0], prior=1)
+    found = eg.colmap.verify_database(path)
+    assert found.config.tolist() == [3, 2 if f == F else 3]
+
+
 def test_keypoints_that_no_ray_is_seen_at_spoil_their_pair_only(tmp_path) -> None:
     pairs = [matches("general", 3), matches("general", 4)]
     params = [F, 600.0, 450.0, -0.5]

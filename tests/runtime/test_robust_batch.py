@@ -106,6 +106,7 @@ def test_an_empty_batch_is_legal() -> None:
         ({"workers": 0}, "workers"),
         ({"executor": 4}, "submit"),
         ({"criterion": "samson"}, "criterion"),
+        ({"covariance1": np.tile(np.eye(2), (9, 1, 1))}, "covariance1 is one a match"),
     ],
 )
 def test_bad_arguments_are_named_once_for_all_pairs(raw, change, name) -> None:

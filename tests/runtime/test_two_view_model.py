@@ -77,6 +77,8 @@ def test_bad_input_is_refused() -> None:
         eg.estimate_two_view(x1[:5], x2[:5])
     with pytest.raises(eg.ArgumentError, match="K1"):
         eg.estimate_two_view(x1, x2, np.zeros((3, 3)))
+    with pytest.raises(eg.ArgumentError, match="K1 has a focal length"):
+        eg.estimate_two_view(x1, x2, np.diag([1e-80, 1e-80, 1.0]))
 
 
 def test_calibration_tells_a_plane_from_a_rotation() -> None:

@@ -323,6 +323,9 @@ def check_options(options: dict[str, Any]) -> None:
     """Raise now, and not once a pair, what is wrong with every pair: tried on a made-up one."""
     # Which no callback is to hear of.
     options = {name: value for name, value in options.items() if name != "callback"}
+    for name in ("covariance1", "covariance2"):
+        if options.get(name) is not None and as_array(name, options[name], "(2, 2)").ndim == 3:
+            raise ArgumentError(name, "is one a match", "a (2, 2) array, the same for all matches")
     grid = np.stack(np.meshgrid([0.0, 1.0, 2.5], [0.0, 1.0, 3.0]), axis=-1).reshape(-1, 2)
     refine_fundamental(grid, grid @ [[1.0, 0.2], [0.1, 1.1]] + grid**2, **options)
 
