@@ -196,7 +196,8 @@ def _from_heic(path: Path, data: bytes) -> Image:
     try:
         file = heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=True)
         width, height = file.size
-        values = np.asarray(file) if width * height <= _MAX_PIXELS else None
+        # A copy: the decoder of old versions takes its memory back with the file.
+        values = np.array(file) if width * height <= _MAX_PIXELS else None
     except Exception as error:
         raise FileFormatError(path, f"is a damaged HEIC file ({cut(error)})") from None
     if values is None:
