@@ -79,7 +79,7 @@ $(STAMPS)/venv:
 	@mkdir -p $(STAMPS) && touch $@
 
 $(STAMPS)/package: $(STAMPS)/venv $(SOURCES)
-	@echo "Installing; compiling the C library takes a minute."
+	@echo "Installing; compiling the C library takes a few minutes."
 	$(PIP) install '.[cli,plot]'
 	@touch $@
 
