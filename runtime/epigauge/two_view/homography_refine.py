@@ -51,7 +51,7 @@ LEAST = 4
 _ROUNDS, _STANDS = 10, 1e-3
 
 #: Distance that 99.9 % of right matches are within, in standard deviations of a coordinate.
-_KEPT = math.sqrt(2.0 * math.log(1000.0))
+DEVIATIONS = math.sqrt(2.0 * math.log(1000.0))
 
 
 @logged
@@ -347,7 +347,7 @@ def _flags(
     if problem.loss.name == "linear" and noise > ROUNDING:
         told["gross errors"] = bool(np.sum(squared[squared > tail]) > TAIL_SHARE * np.sum(squared))
     # As for F: what is said to be right is doubted where the noise is large, or hardly known.
-    near = squared <= _KEPT**2 * noise2
+    near = squared <= DEVIATIONS**2 * noise2
     plain = plane_squares(problem.kernels, state.H, q1, q2)[near]
     wide = not math.sqrt(float(np.mean(plain)) / 2.0) <= WIDE * RANGE if near.any() else True
     if wide or few:

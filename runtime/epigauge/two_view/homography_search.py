@@ -25,7 +25,12 @@ from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.copies import earliest
 from epigauge.two_view.evidence import ROUNDING
 from epigauge.two_view.homography import fit_homography, plane_squares
-from epigauge.two_view.homography_refine import LEAST, refine_homography, with_flags
+from epigauge.two_view.homography_refine import (
+    DEVIATIONS,
+    LEAST,
+    refine_homography,
+    with_flags,
+)
 from epigauge.two_view.homography_result import HomographyResult
 from epigauge.two_view.robust import of_matches
 from epigauge.two_view.search import SCALES, ranked
@@ -47,9 +52,7 @@ _POOLS = (1.0, 0.5, 0.25, 0.125)
 #: Widths of the fits around a sample in scales, and the part of the scale that is rounding.
 _WIDTHS, _FLOOR = (8.0, 3.0, 1.5), 0.01
 
-#: Distance that 99.9 % of right matches are within, in standard deviations of a coordinate, and
-#: what that leaves of the variance.
-_DEVIATIONS = math.sqrt(2.0 * math.log(1000.0))
+#: What is left of the variance within `DEVIATIONS`, which 99.9 % of right matches are within.
 _KEPT = 1.0 - math.log(1000.0) / 999.0
 
 #: Steps of the maximisation of the likelihood, and rounds of inliers at most.
@@ -179,7 +182,7 @@ def estimate_homography(
     for _ in range(_ROUNDS):
         squared = plane_squares(table, H, q1, q2)
         mixture = PlaneMixture.of(squared, mixture.sigma)
-        limit = min(mixture.even, _DEVIATIONS * mixture.sigma, CEILING * RANGE)
+        limit = min(mixture.even, DEVIATIONS * mixture.sigma, CEILING * RANGE)
         limit = max(limit, ROUNDING) if threshold is None else threshold / frame.scale
         inlier = squared <= limit**2
         if np.count_nonzero(inlier) < LEAST:
