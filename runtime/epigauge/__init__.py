@@ -56,7 +56,7 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge.multi_view.affine_start import initialize_affine
     from epigauge.multi_view.compare import Comparison, compare
     from epigauge.multi_view.initialize import initialize
-    from epigauge.multi_view.line_adjust import triangulate_lines
+    from epigauge.multi_view.line_start import triangulate_lines
     from epigauge.multi_view.line_tracks import LineTracks
     from epigauge.multi_view.reconstruction import Reconstruction
     from epigauge.multi_view.tracks import Tracks
@@ -193,7 +193,7 @@ _WHERE = {
     "multi_view.affine_start": "initialize_affine",
     "multi_view.compare": "Comparison compare",
     "multi_view.initialize": "initialize",
-    "multi_view.line_adjust": "triangulate_lines",
+    "multi_view.line_start": "triangulate_lines",
     "multi_view.line_tracks": "LineTracks",
     "multi_view.reconstruction": "Reconstruction",
     "multi_view.tracks": "Tracks",

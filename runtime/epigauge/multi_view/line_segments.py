@@ -1,0 +1,90 @@
+"""Measured segments as the engine takes them: end points of cameras with distortion without it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from epigauge_generated.signatures import SIGNATURES
+from numpy.typing import NDArray
+
+from epigauge.bundle.lines import Segments
+from epigauge.cameras import MetricReconstruction, camera_model
+from epigauge.errors import ArgumentError
+from epigauge.multi_view.line_tracks import LineTracks
+
+__all__ = ["segments_of"]
+
+Array = NDArray[np.float64]
+
+#: Newton steps to a direction without distortion, and pixels that it may be off.
+_STEPS, _MISSED = 30, 1e-6
+
+
+def segments_of(
+    lines: LineTracks, reconstruction: MetricReconstruction, unit: float = 1.0
+) -> Segments:
+    """Return segments as the engine takes them: end points of cameras with distortion without it.
+
+    Their covariances go along to first order.
+
+    Raises
+    ------
+    ArgumentError
+        If a view has no camera, or an end point no direction in its camera.
+    """
+    if not isinstance(lines, LineTracks):
+        raise ArgumentError("lines", f"is a {type(lines).__name__}", "eg.LineTracks(...)")
+    if lines.view.max() >= reconstruction.n_views:
+        was = f"name view {lines.view.max()}"
+        raise ArgumentError("lines", was, f"views 0 to {reconstruction.n_views - 1}")
+    model = camera_model(reconstruction.cameras.model)
+    ends, spread, prefix = lines.segments.T, lines.spread.T / unit**2, model.prefix
+    if f"{prefix}_line_residual" in SIGNATURES:
+        return Segments(lines.view, lines.line, _whole(ends), _whole(spread), prefix)
+    K = reconstruction._calibrations()
+    params = reconstruction.cameras.of_views[lines.view].T
+    moved, covariances = ends.copy(), spread.copy()
+    for k in (0, 1):
+        straight, D = _undistorted(model.kernel("image"), ends[2 * k : 2 * k + 2], params)
+        own, missed = K[lines.view], ~np.isfinite(straight).all(axis=0)
+        if missed.any():
+            was = f"have an end point in row {lines.order[int(np.argmax(missed))]} that the camera"
+            needed = "end points inside of the image"
+            raise ArgumentError("lines", f"{was} {model.name} sees in no direction", needed)
+        moved[2 * k] = own[:, 0, 0] * straight[0] + own[:, 0, 2]
+        moved[2 * k + 1] = own[:, 1, 1] * straight[1] + own[:, 1, 2]
+        xx, xy, yy = spread[3 * k : 3 * k + 3]
+        S = np.array([[xx, xy], [xy, yy]]).transpose(2, 0, 1)
+        D = own[:, :2, :2] @ D
+        S = D @ S @ np.swapaxes(D, 1, 2)
+        covariances[3 * k : 3 * k + 3] = S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]
+    intrinsics = np.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]], axis=1)
+    return Segments(lines.view, lines.line, moved, covariances, "pinhole", intrinsics)
+
+
+def _whole(array: Array) -> Array:
+    return np.ascontiguousarray(array)
+
+
+def _undistorted(image: Any, q: Array, params: Array) -> tuple[Array, Array]:
+    """Return h0/h2, h1/h2 of pixels (2, N), NaN where there is none, and their derivatives."""
+    h = np.zeros((3, q.shape[1]))
+    h[2] = 1.0
+    with np.errstate(all="ignore"):
+        for _ in range(_STEPS):
+            found, slope = image(h, params)
+            a = slope[:, :2].transpose(2, 0, 1)
+            inverse = _inverses(a)
+            h[:2] -= np.einsum("nij,jn->in", inverse, found - q)
+        found, slope = image(h, params)
+        off = np.abs(found - q).max(axis=0)
+        h[:2, ~(off <= _MISSED * np.maximum(1.0, np.abs(q).max(axis=0)))] = np.nan
+        return h[:2], _inverses(slope[:, :2].transpose(2, 0, 1))
+
+
+def _inverses(a: Array) -> Array:
+    """Return inverses of 2x2 matrices, not finite where there are none."""
+    determinant = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
+    adjoint = np.array([[a[:, 1, 1], -a[:, 0, 1]], [-a[:, 1, 0], a[:, 0, 0]]]).transpose(2, 0, 1)
+    return np.asarray(adjoint / determinant[:, None, None])

@@ -1,0 +1,149 @@
+"""Lines from segments in calibrated views whose cameras are known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge import kernels
+from epigauge.bundle.lines import FeatureLinearizer, Segments, unit_lines
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.run import REFINEMENT_METRIC
+from epigauge.bundle.similarity import normal_frame
+from epigauge.cameras import MetricReconstruction, camera_model
+from epigauge.errors import ArgumentError
+from epigauge.kernels import Table
+from epigauge.multi_view.line_segments import segments_of
+from epigauge.multi_view.line_tracks import LineTracks
+from epigauge.two_view.losses import Loss
+
+__all__ = ["OPEN", "ROUNDING", "checked_scene", "spreads", "triangulate_lines", "triangulated"]
+
+Array = NDArray[np.float64]
+
+#: A line is open whose update is uncertain by more than this: radians, or shares of its distance.
+OPEN = 0.3
+
+#: An eigenvalue of a system whose diagonal is one, that is rounding.
+ROUNDING = 1e-11
+
+
+def triangulate_lines(
+    lines: LineTracks, reconstruction: MetricReconstruction, backend: str | None = None
+) -> Array:
+    """Return the lines that segments are images of, cameras being known.
+
+    Each segment and its camera's centre span a plane; the line nearest to all planes of a line is
+    refined to the least squared distances of the end points from its images.
+
+    Parameters
+    ----------
+    lines : LineTracks
+        Measured segments.
+    reconstruction : MetricReconstruction
+        The cameras.
+    backend : {"c", "numpy", "casadi"}, optional
+        Where the formulas are computed.
+
+    Returns
+    -------
+    ndarray, shape (L, 6)
+        Pluecker coordinates (n, v): v the unit direction, n = X x v for every point X of the line.
+
+    Raises
+    ------
+    ArgumentError
+        If lines are not determined, by their numbers: all planes are one within the noise, as of a
+        line in the plane of two centres (an epipolar plane), or the line is infinitely far.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.line_scene(seed=1)
+    >>> eg.triangulate_lines(scene.line_tracks, scene.true).shape
+    (60, 6)
+    """
+    checked_scene("reconstruction", reconstruction)
+    found, deviations = triangulated(lines, reconstruction, kernels.table(backend))
+    bad = np.flatnonzero(~(deviations <= OPEN))
+    if len(bad):
+        named = ", ".join(map(str, bad[:5])) + (", ..." if len(bad) > 5 else "")
+        was = f"have {len(bad)} lines that their views do not determine: {named}"
+        needed = "lines off the plane of the centres that see them (epipolar plane), not too far"
+        raise ArgumentError("lines", was, needed)
+    return found
+
+
+def checked_scene(name: str, scene: Any) -> None:
+    """Check that an argument is a scene of calibrated cameras."""
+    if not isinstance(scene, MetricReconstruction):
+        was = f"is a {type(scene).__name__}"
+        raise ArgumentError(name, was, "an eg.MetricReconstruction, as lines need")
+
+
+def triangulated(
+    lines: LineTracks, reconstruction: MetricReconstruction, table: Table
+) -> tuple[Array, Array]:
+    """Return lines (L, 6), and the largest standard deviation of each one's update, (L,)."""
+    segments = segments_of(lines, reconstruction)
+    home = normal_frame(reconstruction.vectors, reconstruction.X)
+    cameras, _ = home.apply(reconstruction.vectors, reconstruction.X)
+    first = unit_lines(_nearest(segments, cameras, lines.n_lines))
+    bad = ~np.isfinite(first).all(axis=1)
+    first[bad] = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    # No points: an empty part of the features.
+    alone = ObservationGraph(segments.view, segments.line, len(cameras), lines.n_lines)
+    model = camera_model(reconstruction.cameras.model)
+    linearizer = FeatureLinearizer(
+        model,
+        table,
+        alone,
+        np.zeros((2, 0)),
+        np.ones(len(lines)),
+        Loss(),
+        segments=segments,
+        n_points=0,
+    )
+    refined, _ = linearizer.refine_points(cameras, first, REFINEMENT_METRIC)
+    J = linearizer.observe(cameras, refined)[2]
+    deviations = spreads(alone.sum_points(np.einsum("ikn,iln->nkl", J, J)))
+    deviations[bad | ~np.isfinite(refined).all(axis=1)] = np.inf
+    return home.inverse().lines(refined), deviations
+
+
+def spreads(V: Array) -> Array:
+    """Return the largest standard deviation that blocks (L, 4, 4) leave; it may be infinite."""
+    finite = np.all(np.isfinite(V), axis=(1, 2), keepdims=True)
+    values = np.linalg.eigvalsh(np.where(finite, V, 0.0))
+    least = np.where(values[:, 0] > ROUNDING * values[:, -1], values[:, 0], 0.0)
+    with np.errstate(divide="ignore"):
+        return np.asarray(1.0 / np.sqrt(least))
+
+
+def _nearest(segments: Segments, cameras: Array, count: int) -> Array:
+    """Return the lines of least algebraic distance to the planes of their segments, (L, 6)."""
+    rows = segments.cameras(cameras).T
+    pose = rows[:, :12].reshape(-1, 3, 4)
+    k = rows[:, 12:]
+    fx, fy = k[:, 0], k[:, 1] if k.shape[1] == 4 else k[:, 0]
+    cx, cy = k[:, -2], k[:, -1]
+    x1, y1, x2, y2 = segments.ends
+    ones = np.ones(len(rows))
+    a = np.stack([(x1 - cx) / fx, (y1 - cy) / fy, ones], axis=1)
+    b = np.stack([(x2 - cx) / fx, (y2 - cy) / fy, ones], axis=1)
+    normal = np.cross(a, b)
+    planes = np.einsum("nij,ni->nj", pose, normal)
+    # The normal of a plane has the direction of space; the scene has the size of about one.
+    planes /= np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
+    first = np.searchsorted(segments.line, np.arange(count))
+    gram = np.add.reduceat(planes[:, :, None] * planes[:, None, :], first, axis=0)
+    axes = np.linalg.eigh(gram)[1]
+    A, B = axes[:, :, 2], axes[:, :, 3]
+    # The planes A and B meet in the direction of both normals' product.
+    v = np.cross(A[:, :3], B[:, :3])
+    n = A[:, 3:] * B[:, :3] - B[:, 3:] * A[:, :3]
+    with np.errstate(all="ignore"):
+        rows = np.concatenate([n, v], axis=1) / np.linalg.norm(v, axis=1, keepdims=True)
+        return np.asarray(rows)
