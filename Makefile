@@ -18,7 +18,7 @@ SOURCES := pyproject.toml CMakeLists.txt \
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test derive derive-check lint types sanitize cross mutants bench docs dist clean
+.PHONY: help demo test derive derive-check lint types sanitize cross newcomer mutants bench docs dist clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -48,6 +48,9 @@ sanitize: $(STAMPS)/tox ## the C library under AddressSanitizer and UBSan (takes
 cross: $(STAMPS)/venv ## compile the C library for other systems, by zig (takes minutes)
 	$(PIP) install ziglang
 	PYTHON=$(BIN)/python tests/package/cross.sh
+
+newcomer: $(STAMPS)/venv ## walk every command, page and example in a new environment (takes minutes)
+	$(BIN)/python tests/package/newcomer.py
 
 mutants: $(STAMPS)/dev ## plant faults one at a time, report those that no test notices (takes hours)
 	$(BIN)/python tests/mutants planted

@@ -22,7 +22,7 @@ import shlex
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,8 +84,14 @@ def pictures(page: Path) -> list[str]:
     return _PICTURE.findall(page.read_text(encoding="utf-8"))
 
 
-def run(page: Path, folder: Path) -> None:
-    """Run the blocks of a page in a folder that holds the files which pages take for granted."""
+def run(
+    page: Path, folder: Path, run_command: Callable[[list[str], str], None] | None = None
+) -> None:
+    """Run the blocks of a page in a folder that holds the files which pages take for granted.
+
+    `run_command` takes the words of a command and where it stands; without it commands run in this
+    process.
+    """
     provide(folder)
     namespace: dict[str, Any] = {"__name__": "__main__"}
     with contextlib.chdir(folder):
@@ -97,7 +103,7 @@ def run(page: Path, folder: Path) -> None:
                     compare(printed, block.shown, where)
             else:
                 for arguments in commands(block):
-                    _run_command(arguments, where)
+                    (run_command or _run_command)(arguments, where)
 
 
 def provide(folder: Path) -> None:

@@ -51,7 +51,9 @@ def choice(names: Any, text: str) -> Any:
     def similar(incomplete: str) -> list[str]:
         return [name for name in allowed if name.startswith(incomplete)]
 
-    return typer.Option(help=text, parser=str, metavar="|".join(allowed), autocompletion=similar)
+    # In the text they are wrapped between the names, in a column of their own within them.
+    said = f"{text} {' | '.join(allowed)}"
+    return typer.Option(help=said, parser=str, metavar="NAME", autocompletion=similar)
 
 
 def command(function: Callable[P, int]) -> Callable[P, None]:

@@ -1,0 +1,92 @@
+"""The short version of the walk of `newcomer.py`: every command in this process, bad input too."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import html_pages
+import pytest
+
+pytest.importorskip("typer", reason="the command line needs typer")
+pytest.importorskip("rich", reason="the command line needs rich")
+pytest.importorskip("cv2", reason="commands for photographs need OpenCV")
+pytest.importorskip("matplotlib", reason="pictures need Matplotlib")
+
+import commands
+
+
+def newcomer() -> ModuleType:
+    found = importlib.util.spec_from_file_location(
+        "newcomer", Path(__file__).with_name("newcomer.py")
+    )
+    assert found is not None
+    assert found.loader is not None
+    module = importlib.util.module_from_spec(found)
+    found.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    made = tmp_path_factory.mktemp("newcomer")
+    with commands.bare(made):
+        yield made
+
+
+def test_a_newcomer_meets_nothing_that_is_wrong(folder: Path) -> None:
+    parts = dict(newcomer().walk(quick=True, programs=False))
+    assert [problem for problems in parts.values() for problem in problems] == []
+    assert {name.partition(" ")[0].partition(":")[0] for name in parts} >= set(commands.commands())
+
+
+def test_what_is_wrong_is_seen() -> None:
+    """The walk can fail: each check sees a fault of its kind."""
+    fault = commands.Run(["x"], 2, b"", "Traceback (most recent call last)")
+    assert "traceback" in fault.check(2)[0]
+    assert "ends with 1" in commands.Run(["x"], 1, b"1", "").check(0)[0]
+    assert "says nothing" in commands.Run(["x"], 0, b"", "").check(0)[0]
+    assert "though the input is bad" in commands.Run(["x"], 2, b"1", "epigauge: no").check(2)[0]
+    assert "what is bad" in commands.Run(["x"], 2, b"", "no").check(2)[0]
+    assert "warning" in commands.Run(["x"], 0, b"", "DeprecationWarning: old").check(0)[0]
+
+
+@pytest.mark.parametrize(
+    ("body", "problem"),
+    [
+        ('<a href="no.html">x</a>', "leads nowhere"),
+        ('<a href="#no">x</a>', "names no part"),
+        ('<img alt="x" src="data:image/png;base64,">', "is empty"),
+        ('<img src="">', "without a source"),
+        ("<div><b>x</div></b>", "closes nothing"),
+    ],
+)
+def test_faults_of_a_page_are_seen(body: str, problem: str, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    head = '<!doctype html><title>x</title><meta name="viewport" content="width=device-width">'
+    page.write_text(head + body)
+    assert any(problem in found for found in html_pages.problems(page))
+    page.write_text(head + '<p id="x"><a href="#x">x</a>')
+    assert html_pages.problems(page) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("x.png", b"\x89PNG\r\n\x1a\n" + b"\0" * 40),
+        ("x.svg", b"<svg xmlns='http://www.w3.org/2000/svg'></svg>"),
+        ("x.pdf", b"%PDF-1.4 and no end" + b" " * 40),
+        ("x.npz", b"PK" + b" " * 40),
+        ("x.csv", b"a,b\n1\n" * 10),
+        ("x.json", b'{"a": NaN}' + b" " * 40),
+        ("x.ply", b"ply\nelement vertex 0\n" * 4),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_files_that_are_nothing_are_seen(name: str, content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / name
+    assert commands.opened(path) == "was not written"
+    path.write_bytes(content)
+    assert commands.opened(path)
