@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from epigauge import lm
 from epigauge.bundle.dampings import Covariant
+from epigauge.bundle.problem import Estimate
 from epigauge.bundle.similarity import Similarity
 from epigauge.cameras import camera_model
 from epigauge.kernels import table
@@ -98,11 +99,7 @@ def test_steps_are_the_same_in_twenty_frames():
         made, _ = line_job(scene.tracks, start, scene.line_tracks, table())
         problem, begin = made.problem, made.start
         if there is not None:  # in that very frame, not in the one that suits best
-            begin = copy.copy(begin)
-            rows = np.zeros_like(begin.points)
-            rows[:15, :3], rows[15:] = start.X, start.lines
-            object.__setattr__(begin, "cameras", start.vectors)
-            object.__setattr__(begin, "points", rows)
+            begin = Estimate(start.vectors, start.X, others=(start.lines,))
         outcome = lm.minimize(
             problem, begin, Covariant(), lm.Classic(), lm.Stopping(1e-14, 0.0, 0.0, 5)
         )

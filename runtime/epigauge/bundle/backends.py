@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -48,6 +49,7 @@ def linearizer_for(
     workers: int | Elsewhere = 1,
     ties: Ties | None = None,
     whitening: Array | None = None,
+    beside: Sequence[ObservationGraph] = (),
 ) -> Linearizer:
     """Return what evaluates observations of cameras of a model.
 
@@ -71,10 +73,14 @@ def linearizer_for(
         What own tangents are made of: entries of a camera's that are always zero need no work.
     whitening : ndarray, shape (2, 2, N), optional
         What residuals are multiplied by; the compiled evaluation knows none.
+    beside : sequence of ObservationGraph
+        Those of features of other kinds, which take off the same cameras' blocks.
     """
     if not isinstance(workers, int):
+        assert not beside
         return workers.linearizer(model, kernels, graph, q, weights, loss, ties, whitening)
     if kernels.compiled and whitening is None:
         used = None if ties is None else ties.used
-        return NativeLinearizer(model, graph, q, weights, loss, workers, used)
+        parts = graph, q, weights, loss, workers, used
+        return NativeLinearizer(model, *parts, beside=beside)
     return NumpyLinearizer(model, kernels, graph, q, weights, loss, whitening)

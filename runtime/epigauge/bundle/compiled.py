@@ -160,6 +160,7 @@ def _known(problem: BundleProblem, own: NativeLinearizer, damping: Any, schedule
         free
         and (model.metric or own.factored)
         and problem.priors is None
+        and not problem.kinds
         and problem.refinement is not None
         and type(damping) is Covariant
         and schedule in (lm.Classic(), lm.Adaptive())

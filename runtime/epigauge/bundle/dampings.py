@@ -76,7 +76,8 @@ class Levenberg(ByMatrix):
     def blocks(self, system: BundleSystem) -> Blocks:
         """Return identities."""
         x, s, y = system.gradients
-        return Blocks(_identities(x), np.ones(len(s)), _identities(y))
+        others = tuple(_identities(own.g_points) for own in system.normal.others)
+        return Blocks(_identities(x), np.ones(len(s)), _identities(y), others)
 
 
 class Marquardt(ByMatrix):
@@ -85,7 +86,8 @@ class Marquardt(ByMatrix):
     def blocks(self, system: BundleSystem) -> Blocks:
         """Return the diagonals."""
         shared = np.diagonal(system.U_shared)
-        return Blocks(_diagonals(system.U), _positive(shared), _diagonals(system.V))
+        others = tuple(_diagonals(own.V) for own in system.normal.others)
+        return Blocks(_diagonals(system.U), _positive(shared), _diagonals(system.V), others)
 
 
 @dataclass(frozen=True)
@@ -110,19 +112,23 @@ class Covariant(ByMatrix):
 
     def blocks(self, system: BundleSystem) -> Blocks:
         """Return the blocks of W."""
-        if system.model.homogeneous:
+        model = system.model
+        others = tuple(
+            point_damping(model, own.V, None if own.depth_blocks is None else own.depth_blocks[1])
+            for own in system.normal.others
+        )
+        if model.homogeneous:
             cameras, points = system.depth_blocks
-            return Blocks(
-                system.U + cameras, np.ones(0), point_damping(system.model, system.V, points)
-            )
-        points = point_damping(system.model, system.V, None)
-        if not system.model.metric:
-            return Blocks(lifted(system.U), np.ones(0), lifted(points))
+            points = point_damping(model, system.V, points)
+            return Blocks(system.U + cameras, np.ones(0), points, others)
+        points = point_damping(model, system.V, None)
+        if not model.metric:
+            return Blocks(lifted(system.U), np.ones(0), lifted(points), others)
         diagonal = np.einsum("nii->ni", system.U)
         # An unknown that moves no image, as the distortion of points on the axis: of the others'.
         diagonal = np.maximum(diagonal, _SMALL * diagonal.max(axis=0))
         cameras = np.where(diagonal > 0.0, diagonal, 1.0)[:, :, None] * np.eye(diagonal.shape[1])
-        return Blocks(cameras, _positive(np.diagonal(system.U_shared)), points)
+        return Blocks(cameras, _positive(np.diagonal(system.U_shared)), points, others)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.bundle.linearizer import Pairs
+
 __all__ = ["DenseBlocks", "DenseFactor", "DenseInverse", "DensePairs"]
 
 Array = NDArray[np.float64]
@@ -38,6 +40,10 @@ class DensePairs:
         n, d, k = F.shape
         flat = F.reshape(n * d, k)
         return DensePairs(self.P - (flat @ flat.T).reshape(n, d, n, d))
+
+    def plus(self, other: Pairs) -> DensePairs:
+        """Return the sum with what features of another kind take off."""
+        return DensePairs(self.P + other.dense())
 
     def times(self, x: Array) -> Array:
         """Return P x for x (n, d, k)."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from epigauge.bundle.dampings import Covariant
 from epigauge.bundle.null_space import generators
 from epigauge.bundle.point_blocks import Triangle, solved_points
-from epigauge.bundle.reduced import Bordered, Iterated, reduced_system
-from epigauge.bundle.solve import BundleSystem
+from epigauge.bundle.reduced import Bordered, Eliminated, Iterated, reduced_system
+from epigauge.bundle.solve import Blocks, BundleSystem
 from epigauge.bundle.ties import Ties, congruent
 from epigauge.kernels import Table
 
@@ -92,17 +92,21 @@ def diagnosed(
     ties = system.ties.then(whitening, None).scaled(1.0 / np.sqrt(W.shared))
     free = ~known
     of_points = _open(system.V, W.points) if free.all() else _open(system.V[free], W.points[free])
+    # Features of other kinds are free.
+    for own, sizes in zip(system.normal.others, W.others, strict=True):
+        of_points += _open(own.V, sizes)
     white = congruent(ties.A, system.normal.U)
     a, r = white.shape[1], ties.n_shared
     frozen = 0 if system.ties.A is None else int(np.count_nonzero(~system.ties.A.any(axis=1)))
     unknowns = n * a - frozen + r + 3 * int(np.count_nonzero(free))
+    unknowns += sum(own.g_points.size for own in system.normal.others)
     gauge = _free_gauge(system, kernels) if fixes_gauge else system.model.gauge_dimension
     nothing = np.zeros((n, d))
     silent: dict[str, Any] = {"spread": nothing, "points": np.zeros((len(free), 3))}
     silent["gauge"] = gauge
     if not system.normal.coupling.direct:
         return Diagnosis(unknowns - gauge - of_points, 0, float("inf"), nothing, **silent)
-    factored = _factored(system, ties, W.points, white)
+    factored = _factored(system, ties, W, white)
     if factored is None:
         return Diagnosis(unknowns - gauge - of_points - 1, 1, float("inf"), nothing, **silent)
     shifted, shift = factored
@@ -155,15 +159,14 @@ def _beside_gauge(system: BundleSystem, kernels: Table, own: Array) -> Array:
 
 
 def _factored(
-    system: BundleSystem, ties: Ties, of_points: Array, white: Array
+    system: BundleSystem, ties: Ties, W: Blocks, white: Array
 ) -> tuple[Bordered | Iterated, float] | None:
     """Return the reduced system plus a shift, and that; None where it stays indefinite."""
     for shift in _SHIFTS:
         try:
-            T, _ = system.inverse_roots(system.V, of_points, shift, system.gradients[2])
-            parts = system.normal, ties, system.own_roots(T), None
+            kinds = [Eliminated(own.coupling, own.T) for own in system.eliminated(W, shift)]
             lifted = white + shift * np.eye(white.shape[1])
-            return reduced_system(*parts, lifted, shift)[0], shift
+            return reduced_system(kinds, system.normal.U, ties, lifted, shift)[0], shift
         except np.linalg.LinAlgError:
             continue
     return None
@@ -194,6 +197,8 @@ def _free_gauge(system: BundleSystem, kernels: Table) -> int:
 
     A motion of the gauge is free where the unknowns can make it and no prior resists.
     """
+    # Features of other kinds are free: they go along with what moves cameras and points.
+    system = replace(system, normal=system.normal.alone(), other_roots=())
     cameras, points = generators(system.model, kernels, system.cameras, system.points)
     g, ties = cameras.shape[2], system.ties
     size = np.sqrt(np.sum(cameras**2, axis=(0, 1)) + np.sum(points**2, axis=(0, 1)))

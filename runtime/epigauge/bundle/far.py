@@ -188,7 +188,8 @@ def short_of_minimum(problem: BundleProblem, state: BundleState, start: Estimate
     points = np.where(better[:, None], jumped, state.points)
     few = lm.Stopping(ftol=_SHORT, xtol=0.0, gtol=0.0, max_iter=_CHECKING)
     damping, schedule = Covariant(), lm.Classic()
-    found = lm.minimize(problem, Estimate(state.cameras, points), damping, schedule, few)
+    trial = Estimate(state.cameras, points, others=state.others)
+    found = lm.minimize(problem, trial, damping, schedule, few)
     if found.state.cost < (1.0 - _SHORT) * state.cost:
         return True
     if not _is_far(problem, start):

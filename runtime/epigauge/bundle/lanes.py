@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,8 @@ class LaneLayout:
         Entries of a camera's tangent that are computed with.
     heaviest : float, optional
         Largest weight of all observations, where these are a part of them.
+    beside : sequence of ObservationGraph
+        Those of features of other kinds, whose pairs of cameras the skyline has, too.
 
     Attributes
     ----------
@@ -70,7 +73,9 @@ class LaneLayout:
         model: int,
         columns: NDArray[np.int32],
         heaviest: float | None = None,
+        beside: Sequence[ObservationGraph] = (),
     ) -> None:
+        self._beside = beside
         self._graph, self._q, self._weights, self.columns = graph, q, weights, columns
         counts = np.diff(graph.first)
         self.points = points = _together(graph, counts)
@@ -131,10 +136,14 @@ class LaneLayout:
         """
         if self._skyline is None:
             graph, n = self._graph, self._graph.n_views
-            self._skyline = Skyline.full(n) if n <= FULL else Skyline.of(graph.lowest)
+            lowest = (own.lowest for own in (graph, *self._beside))
+            full = n <= FULL
+            self._skyline = Skyline.full(n) if full else Skyline.of(np.min([*lowest], axis=0))
             if self._skyline.wide:
                 together = np.zeros((n, n), np.bool_)
                 function("bundle_neighbours")(ctypes.byref(self._bundle), address(together))
+                for own in self._beside:
+                    together |= own.together
                 self._skyline, self.order = narrow(together)
             if self.order is not None:
                 number = self.number[graph.view]

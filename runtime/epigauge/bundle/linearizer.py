@@ -3,11 +3,15 @@
 Two classes answer: `NumpyLinearizer` over the generated kernels of any back end, which stores all
 Jacobians, and `NativeLinearizer` in C, which stores none. Cameras are rows (n, c) of a model's
 storage, points rows (m, b); steps are in own tangents, d numbers a camera and b a point.
+
+Features of other kinds than points, as lines, have observations and an evaluation of their own, a
+`FeatureKind`. They are eliminated as points are: what all kinds take off the cameras is added up.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -23,6 +27,7 @@ __all__ = [
     "Coupling",
     "Factor",
     "FactorInverse",
+    "FeatureKind",
     "Linearizer",
     "Normal",
     "Pairs",
@@ -104,6 +109,9 @@ class Pairs(Protocol):
             If it is not positive definite.
         """
 
+    def plus(self, other: Pairs) -> Pairs:
+        """Return the sum with what features of another kind take off; P has its blocks."""
+
     def times(self, x: Array) -> Array:
         """Return P x for x (n, d, k)."""
 
@@ -168,6 +176,8 @@ class Normal:
         The blocks that couple both.
     depth_blocks : tuple of ndarray, or None
         For homogeneous points the blocks of Z^T Z, Z = d log depth weighted as the residuals.
+    others : tuple of Normal
+        Those of features of other kinds than points; `U` and `g_cameras` are the sums of all.
     """
 
     U: Array
@@ -176,6 +186,52 @@ class Normal:
     g_points: Array
     coupling: Coupling
     depth_blocks: tuple[Array, Array] | None = None
+    others: tuple[Normal, ...] = ()
+
+    def beside(self, others: Sequence[Normal]) -> Normal:
+        """Return the normal equations of these features and those of other kinds."""
+        if not others:
+            return self
+        U, g = (
+            sum(parts) for parts in zip(*((own.U, own.g_cameras) for own in others), strict=True)
+        )
+        U, g = self.U + U, self.g_cameras + g
+        return replace(self, U=U, g_cameras=g, others=(*self.others, *others))
+
+    def alone(self) -> Normal:
+        """Return the normal equations of points, those of other kinds taken off again."""
+        U, g = self.U, self.g_cameras
+        for own in self.others:
+            U, g = U - own.U, g - own.g_cameras
+        return replace(self, U=U, g_cameras=g, others=())
+
+
+class FeatureKind(Protocol):
+    """Evaluates cameras (n, c) and the features (k, f) of one kind, with tangents (k, t)."""
+
+    @property
+    def graph(self) -> ObservationGraph:
+        """Return which observation belongs to what; features stand for points."""
+
+    def residuals(self, cameras: Array, points: Array) -> Array:
+        """Return the residuals, (2, N)."""
+
+    def point_costs(self, cameras: Array, points: Array) -> Array:
+        """Return the weighted robust sum of each feature, (k,)."""
+
+    def linearize(self, cameras: Array, points: Array) -> Normal:
+        """Return the normal equations of these observations alone."""
+
+    def refine_points(
+        self, cameras: Array, points: Array, how: PointRefinement
+    ) -> tuple[Array, Array]:
+        """Return the features moved to where their own observations want them, and their costs."""
+
+    def inverse_roots(self, V: Array, D: Array, lam: float, g: Array) -> tuple[Array, Array]:
+        """Return T with T T^T = (V + lam D)^-1 for blocks (k, t, t), and T^T g."""
+
+    def moved(self, cameras: Array, points: Array, step: Array) -> Array:
+        """Return the features after a step (k, t) of their tangents at these cameras."""
 
 
 class Linearizer(Protocol):

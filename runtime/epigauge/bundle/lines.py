@@ -1,43 +1,33 @@
-"""Lines beside points: both are features of four unknowns, eliminated alike.
+"""Lines: a kind of features of four unknowns, beside points.
 
-The features of a problem are rows (m + L, 6): points (X, 0, 0, 0), then lines (n, v) with v a unit
-vector. Their tangents have four entries; the last one of a point moves nothing. A line's update is
-that of its orthonormal representation about the centre, of those cameras that see it, that is
-farthest from it: similarities take it along, and the line is off it.
+A line is a row (n, v) of Pluecker coordinates with v a unit vector. Its update is that of its
+orthonormal representation about the centre, of those cameras that see it, that is farthest from it:
+similarities take it along, and the line is off it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.bundle.freedom import Freedom
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.bundle.observations import ObservationGraph
-from epigauge.bundle.problem import BundleProblem, BundleState
-from epigauge.bundle.ties import Ties
-from epigauge.multi_view.measured import whitened
+from epigauge.cameras import CameraModel
+from epigauge.kernels import Table
+from epigauge.two_view.losses import Loss
 
-__all__ = [
-    "FeatureLinearizer",
-    "FeatureProblem",
-    "Segments",
-    "feature_freedom",
-    "features_of",
-    "joint_graph",
-    "unit_lines",
-]
+__all__ = ["LineLinearizer", "Segments", "unit_lines"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 _QUIET: dict[str, Any] = {"divide": "ignore", "invalid": "ignore", "over": "ignore"}
 
-#: Entries of a feature, and of its tangent.
-_ROW, _TANGENT = 6, 4
+#: Entries of the tangent of a camera's pose.
+_POSE = 6
 
 
 @dataclass(frozen=True)
@@ -82,106 +72,64 @@ class Segments:
 
 
 @dataclass(frozen=True)
-class FeatureLinearizer(NumpyLinearizer):
-    """The evaluation of points, then lines; graph, weights and whitening are those of both.
+class LineLinearizer(NumpyLinearizer):
+    """The evaluation of lines: a `FeatureKind`, its features rows (L, 6), their tangents (L, 4).
+
+    Residuals are the distances of both end points from the image of the line, over their standard
+    deviations.
 
     Attributes
     ----------
     segments : Segments
-        The observations of lines.
-    n_points : int
-        Number of points.
+        The observations.
     """
 
     segments: Segments = field(kw_only=True)
-    n_points: int = field(kw_only=True)
+
+    @staticmethod
+    def of(
+        segments: Segments,
+        model: CameraModel,
+        kernels: Table,
+        sizes: tuple[int, int],
+        loss: Loss | None = None,
+    ) -> LineLinearizer:
+        """Return the evaluation of segments in cameras of a model; sizes are views and lines."""
+        graph = ObservationGraph(segments.view, segments.line, *sizes)
+        ones = np.ones(len(segments.view))
+        parts = model, kernels, graph, segments.ends, ones, loss or Loss()
+        return LineLinearizer(*parts, segments=segments)
 
     def residuals(self, cameras: Array, points: Array) -> Array:
-        """Return r = q - q_hat of points, distances of lines over their deviations, (2, N)."""
-        own, lines = self.segments, points[self.n_points :]
+        """Return the distances over their deviations, (2, N)."""
+        own = self.segments
         residual = getattr(self.kernels, f"{own.prefix}_line_residual")
         with np.errstate(**_QUIET):
-            of_points = self._kernel("residual")(*self._gathered(cameras, points), self.q)
-            parts = own.cameras(cameras), lines.T[:, own.line], own.ends, own.spread
-            of_lines = residual(*parts)
-        return np.concatenate([of_points, of_lines], axis=1)
+            parts = own.cameras(cameras), points.T[:, own.line], own.ends, own.spread
+            return np.asarray(residual(*parts))
 
     def observe(self, cameras: Array, points: Array) -> tuple[Array, Array, Array]:
-        """Return r (2, N), and the Jacobians by camera (2, d, N) and feature (2, 4, N)."""
-        own, lines = self.segments, points[self.n_points :]
-        count = self.q.shape[1]
-        d, N = self.model.tangent_size, count + len(own.view)
-        r, A, B = np.empty((2, N)), np.zeros((2, d, N)), np.zeros((2, _TANGENT, N))
+        """Return r (2, N), and the Jacobians by camera (2, d, N) and line (2, 4, N)."""
+        own = self.segments
         observe = getattr(self.kernels, f"{own.prefix}_line_observe")
         with np.errstate(**_QUIET):
-            found = self._kernel("observe")(*self._gathered(cameras, points), self.q)
-            r[:, :count], A[:, :, :count], B[:, :3, :count] = found
-            origin = self.segments.origins(cameras, lines).T[:, own.line]
-            parts = own.cameras(cameras), lines.T[:, own.line], origin, own.ends, own.spread
-            r[:, count:], by_camera, B[:, :, count:] = observe(*parts)
-            # Cameras that stand for others have intrinsics of their own, which stay.
-            size = by_camera.shape[1] if own.intrinsics is None else 6
-            A[:, :size, count:] = by_camera[:, :size]
-            whole = tuple(whitened(self.whitening, part) for part in (r, A, B))
-        return whole[0], whole[1], whole[2]
+            origin = own.origins(cameras, points).T[:, own.line]
+            parts = own.cameras(cameras), points.T[:, own.line], origin, own.ends, own.spread
+            r, by_camera, by_line = observe(*parts)
+        if own.intrinsics is None:
+            return r, by_camera, by_line
+        # Cameras that stand for others have intrinsics of their own, which stay.
+        A = np.zeros((2, self.model.tangent_size, r.shape[1]))
+        A[:, :_POSE] = by_camera[:, :_POSE]
+        return r, A, by_line
 
     def moved(self, cameras: Array, points: Array, step: Array) -> Array:
-        """Return features after a step: points by addition, lines by their update."""
-        m = self.n_points
-        moved = points.copy()
-        moved[:m, :3] += step[:m, :3]
-        lines = points[m:]
-        origins = self.segments.origins(cameras, lines)
+        """Return the lines after a step of their tangents at these cameras."""
+        origins = self.segments.origins(cameras, points)
         with np.errstate(**_QUIET):
-            moved[m:] = self.kernels.line_retract(lines.T, origins.T, step[m:].T).T
-            moved[m:] /= np.linalg.norm(moved[m:, 3:], axis=1, keepdims=True)
+            moved = np.array(self.kernels.line_retract(points.T, origins.T, step.T).T)
+            moved /= np.linalg.norm(moved[:, 3:], axis=1, keepdims=True)
         return moved
-
-    def _gathered(self, cameras: Array, points: Array) -> tuple[Array, Array]:
-        graph, count = self.graph, self.q.shape[1]
-        return (
-            np.ascontiguousarray(cameras.T[:, graph.view[:count]]),
-            np.ascontiguousarray(points.T[:3, graph.point[:count]]),
-        )
-
-
-@dataclass(frozen=True)
-class FeatureProblem(BundleProblem):
-    """The problem of points and lines."""
-
-    def moved(self, state: BundleState, step: Array) -> Array:
-        """Return the features after a step."""
-        assert isinstance(self.linearizer, FeatureLinearizer)
-        return self.linearizer.moved(state.cameras, state.points, step)
-
-
-def features_of(points: Array, lines: Array) -> Array:
-    """Return points (m, 3) and lines (L, 6) as rows (m + L, 6)."""
-    rows = np.zeros((len(points) + len(lines), _ROW))
-    rows[: len(points), :3], rows[len(points) :] = points, lines
-    return rows
-
-
-def feature_freedom(freedom: Freedom, m: int, count: int) -> Freedom:
-    """Return what is free where so many lines, which are free, follow the m points."""
-    C, kept, ties = freedom.ties.C, freedom.kept, freedom.ties
-    if C is not None:
-        whole = np.tile(np.eye(_TANGENT), (m + count, 1, 1))
-        whole[:m, :3, :3] = C
-        C = whole
-    if kept is not None:
-        kept = np.concatenate([kept, np.zeros(count, np.bool_)])
-    return Freedom(Ties(ties.A, ties.E, ties.index, ties.n_shared, C), kept)
-
-
-def joint_graph(graph: ObservationGraph, segments: Segments, count: int) -> ObservationGraph:
-    """Return who sees which feature, so many lines after the points."""
-    return replace(
-        graph,
-        view=np.concatenate([graph.view, segments.view]),
-        point=np.concatenate([graph.point, graph.n_points + segments.line]),
-        n_points=graph.n_points + count,
-    )
 
 
 def unit_lines(lines: Array) -> Array:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -33,7 +33,7 @@ from epigauge._native import (
     function,
 )
 from epigauge.bundle.lanes import LaneLayout, Range
-from epigauge.bundle.linearizer import CameraBlocks, Normal, PointRefinement
+from epigauge.bundle.linearizer import CameraBlocks, Normal, Pairs, PointRefinement
 from epigauge.bundle.native_inverse import NativeBlocks, NativeInverse
 from epigauge.bundle.numpy_linearizer import DENSE_CAMERAS
 from epigauge.bundle.observations import ObservationGraph
@@ -80,6 +80,8 @@ class NativeLinearizer:
         their Jacobian; by default they do.
     heaviest : float, optional
         Largest weight of all observations, where these are a part of them.
+    beside : sequence of ObservationGraph
+        Those of features of other kinds, which take off the same cameras' blocks.
     """
 
     def __init__(
@@ -93,6 +95,7 @@ class NativeLinearizer:
         columns: ArrayLike | None = None,
         factored: bool | None = None,
         heaviest: float | None = None,
+        beside: Sequence[ObservationGraph] = (),
     ) -> None:
         self.model, self.graph, self.loss = model, graph, loss
         self.q, self.weights = q, weights
@@ -109,8 +112,9 @@ class NativeLinearizer:
             )
         #: None where all entries are computed with.
         self._used: Indices | None = None if len(used) == len(whole) else used
-        self.layout = LaneLayout(graph, q, weights, row, used.astype(np.int32), heaviest)
-        self._heaviest = heaviest
+        entries = used.astype(np.int32)
+        self.layout = LaneLayout(graph, q, weights, row, entries, heaviest, beside)
+        self._heaviest, self._beside = heaviest, beside
         self._bundle = self.layout.bundle(loss)
         self.reference = ctypes.byref(self._bundle)
         camera_sums, self.pair_sums = ctypes.c_ssize_t(), Blocks()
@@ -126,7 +130,8 @@ class NativeLinearizer:
         """Pickle what it was made from: addresses and threads mean nothing elsewhere."""
         workers = max(len(self._passes), len(self._pairs))
         own = self.model, self.graph, self.q, self.weights, self.loss
-        return NativeLinearizer, (*own, workers, self._used, self.factored, self._heaviest)
+        parts = workers, self._used, self.factored, self._heaviest, self._beside
+        return NativeLinearizer, (*own, *parts)
 
     def __copy__(self) -> NativeLinearizer:
         other = object.__new__(type(self))
@@ -480,6 +485,18 @@ class NativePairs:
         some = np.flatnonzero(np.isin(rows, views) & np.isin(columns, views))
         blocks = self.blocks.copy()
         blocks[some] -= inner[columns[some]] @ np.swapaxes(inner[rows[some]], 1, 2)
+        return replace(self, sums=blocks, how=Blocks.dense(blocks.shape[1]))
+
+    def plus(self, other: Pairs) -> NativePairs:
+        """Return the sum with what features of another kind take off."""
+        own, (rows, columns), P = self.linearizer, self.skyline.places, other.dense()
+        order = own.layout.order
+        if order is not None:
+            rows, columns = order[rows], order[columns]
+        more = P.transpose(0, 2, 1, 3)[columns, rows]
+        if own._used is not None:
+            more = more[:, own._used[:, None], own._used]
+        blocks = self.blocks + more
         return replace(self, sums=blocks, how=Blocks.dense(blocks.shape[1]))
 
     def times(self, x: Array) -> Array:

@@ -16,10 +16,9 @@ from epigauge.bundle.linearizer import (
     PointRefinement,
     point_damping,
 )
-from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.observations import ObservationGraph, whitened
 from epigauge.cameras import CameraModel
 from epigauge.kernels import Table
-from epigauge.multi_view.measured import whitened
 from epigauge.two_view.losses import Loss
 
 __all__ = ["NumpyLinearizer", "inverse_roots", "normal_equations"]

@@ -1,4 +1,4 @@
-"""Which observation belongs to which camera and point: the visibility graph."""
+"""Which observation belongs to which camera and point, and what whitens its coordinates."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ObservationGraph"]
+__all__ = ["ObservationGraph", "whitened"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -56,6 +56,13 @@ class ObservationGraph:
         return found
 
     @cached_property
+    def together(self) -> NDArray[np.bool_]:
+        """Return which pairs of views share a point, (n, n)."""
+        seen = np.zeros((self.n_points, self.n_views), np.float32)
+        seen[self.point, self.view] = 1.0
+        return np.asarray(seen.T @ seen > 0.0)
+
+    @cached_property
     def simple(self) -> ObservationGraph:
         """Return the graph without repetitions: one edge a pair of view and point."""
         if self.first_of_edge is None:
@@ -91,3 +98,11 @@ class ObservationGraph:
         edge = np.zeros(len(self.view), np.intp)
         edge[self.first_of_edge[1:]] = 1
         return values[np.cumsum(edge)]
+
+
+def whitened(whitening: Array | None, values: Array) -> Array:
+    """Return W times vectors (2, N) or rows of matrices (2, k, N); the same where W is None."""
+    if whitening is None:
+        return values
+    W = whitening if values.ndim == 2 else whitening[:, :, None]
+    return np.asarray(np.stack([np.sum(row * values, axis=0) for row in W]))

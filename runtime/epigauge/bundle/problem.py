@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge.bundle import compiled
 from epigauge.bundle.freedom import Freedom
-from epigauge.bundle.linearizer import Linearizer, Normal, PointRefinement
+from epigauge.bundle.linearizer import FeatureKind, Linearizer, Normal, PointRefinement
 from epigauge.bundle.priors import Priors
 from epigauge.bundle.solve import BundleSystem, Step
 from epigauge.cameras import MAX_FOCAL, MIN_FOCAL, CameraModel
@@ -34,16 +34,19 @@ class Estimate:
 
     Attributes
     ----------
+    others : tuple of ndarray
+        Features of other kinds, in the order of the problem's `kinds`.
     steps : int
         How many steps led here.
     point_costs : ndarray, shape (m,), or None
-        The points' share of the cost, where it is known already.
+        The features' share of the cost, where it is known already: points, then other kinds.
     """
 
     cameras: Array
     points: Array
     steps: int = 0
     point_costs: Array | None = None
+    others: tuple[Array, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,11 @@ class BundleState:
     def points(self) -> Array:
         """Return the points, (m, b)."""
         return self.estimate.points
+
+    @property
+    def others(self) -> tuple[Array, ...]:
+        """Return the features of other kinds."""
+        return self.estimate.others
 
 
 @dataclass(frozen=True)
@@ -84,6 +92,8 @@ class BundleProblem:
         After each step re-triangulate every point (variable projection), and how.
     floor : float
         A cost this low is rounding error.
+    kinds : tuple of FeatureKind
+        Features of other kinds than points, and what evaluates them.
     """
 
     model: CameraModel
@@ -93,6 +103,7 @@ class BundleProblem:
     priors: Priors | None = None
     refinement: PointRefinement | None = None
     floor: float = 0.0
+    kinds: tuple[FeatureKind, ...] = ()
 
     def compiled(
         self,
@@ -123,6 +134,8 @@ class BundleProblem:
         costs = estimate.point_costs
         if costs is None:
             costs = self.linearizer.point_costs(estimate.cameras, estimate.points)
+            more = (own.point_costs(estimate.cameras, rows) for own, rows in self._each(estimate))
+            costs = np.concatenate([costs, *more]) if self.kinds else costs
         with np.errstate(over="ignore"):
             cost = 0.5 * float(costs.sum())
         if self.priors is not None:
@@ -134,6 +147,8 @@ class BundleProblem:
     def linearize(self, state: BundleState) -> BundleSystem:
         """Return the normal equations."""
         normal = self.linearizer.linearize(state.cameras, state.points)
+        others = [own.linearize(state.cameras, rows) for own, rows in self._each(state.estimate)]
+        normal = normal.beside(others)
         return self._system(normal, state.estimate)
 
     def _system(self, normal: Normal, estimate: Estimate) -> BundleSystem:
@@ -150,6 +165,7 @@ class BundleProblem:
             self.linearizer.inverse_roots,
             ties,
             border,
+            tuple(own.inverse_roots for own in self.kinds),
             model=self.model,
             cameras=cameras,
             points=points,
@@ -159,18 +175,26 @@ class BundleProblem:
         """Return the estimate that a step leads to, its points re-triangulated where asked for."""
         cameras = self.retraction(state.cameras, step.cameras)
         cameras = self.freedom.retracted(state.cameras, cameras, step.cameras)
-        points, steps = self.moved(state, step.points), state.estimate.steps + 1
+        points, steps = state.points + step.points, state.estimate.steps + 1
+        others = tuple(
+            own.moved(state.cameras, rows, tangents)
+            for (own, rows), tangents in zip(self._each(state.estimate), step.others, strict=True)
+        )
         cameras, points = self.freedom.settled(cameras, points, steps)
         if self.model.homogeneous:
             cameras, points = in_range(cameras), in_range(points)
         if self.refinement is None:
-            return Estimate(cameras, points, steps)
-        refined, costs = self.refined(cameras, points)
-        return Estimate(cameras, refined, steps, costs)
-
-    def moved(self, state: BundleState, step: Array) -> Array:
-        """Return the points after a step."""
-        return np.asarray(state.points + step)
+            return Estimate(cameras, points, steps, None, others)
+        points, costs = self.refined(cameras, points)
+        if not others:
+            return Estimate(cameras, points, steps, costs)
+        how = self.refinement
+        own = [
+            kind.refine_points(cameras, rows, how)
+            for kind, rows in zip(self.kinds, others, strict=True)
+        ]
+        costs = np.concatenate([costs, *(more for _, more in own)])
+        return Estimate(cameras, points, steps, costs, tuple(rows for rows, _ in own))
 
     def refined(self, cameras: Array, points: Array) -> tuple[Array, Array]:
         """Return points after iterations of their own, and their costs."""
@@ -181,6 +205,10 @@ class BundleProblem:
             return refined, costs
         refined = np.where(kept[:, None], points, refined)
         return refined, self.linearizer.point_costs(cameras, refined)
+
+    def _each(self, estimate: Estimate) -> list[tuple[FeatureKind, Array]]:
+        """Return the kinds beside points, each with its features."""
+        return list(zip(self.kinds, estimate.others, strict=True)) if self.kinds else []
 
     def _focal(self, cameras: Array) -> bool:
         places = list(self.model.focal)

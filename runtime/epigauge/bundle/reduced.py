@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.bundle.linearizer import CameraBlocks, Coupling, Normal, Pairs
+from epigauge.bundle.linearizer import CameraBlocks, Coupling, Pairs
 from epigauge.bundle.ties import Ties
 
-__all__ = ["Bordered", "Iterated", "conjugate_gradients", "reduced_system"]
+__all__ = ["Bordered", "Eliminated", "Iterated", "conjugate_gradients", "reduced_system"]
 
 Array = NDArray[np.float64]
 
@@ -18,32 +19,74 @@ _CG_TOLERANCE = 1e-10
 _CG_ITERATIONS = 2000
 
 
+class Eliminated(NamedTuple):
+    """The features of one kind, in own tangents.
+
+    Attributes
+    ----------
+    coupling : Coupling
+        With the cameras.
+    T : ndarray, shape (m, b, b)
+        Inverse roots of the features' blocks.
+    half : ndarray, shape (m, b), or None
+        T^T times a right-hand side.
+    """
+
+    coupling: Coupling
+    T: Array
+    half: Array | None = None
+
+
 def reduced_system(
-    normal: Normal, ties: Ties, T: Array, half: Array | None, white: Array, lam: float
+    kinds: Sequence[Eliminated], U: Array, ties: Ties, white: Array, lam: float
 ) -> tuple[Bordered | Iterated, Array]:
-    """Return the reduced system of the views' unknowns, and W T half, (n, d).
+    """Return the reduced system of the views' unknowns, and the sum of W T half, (n, d).
 
     Parameters
     ----------
-    normal : Normal
-        In own tangents.
+    kinds : sequence of Eliminated
+        All features: points, then those of other kinds.
+    U : ndarray, shape (n, d, d)
+        Blocks of the cameras, in own tangents.
     ties : Ties
         From the unknowns.
-    T : ndarray, shape (m, b, b)
-        Inverse roots of the points' blocks, in own tangents.
-    half : ndarray, shape (m, b), or None
-        T^T times a right-hand side.
     white : ndarray, shape (n, a, a)
         Blocks of the views' own unknowns, lam I and all else included.
     lam : float
         Added to the diagonal of the shared ones.
     """
-    coupling = normal.coupling
-    if coupling.direct:
-        pairs, right = coupling.schur(T, half)
-        return Bordered(pairs, normal.U, ties, white, lam), right
-    right = np.zeros(normal.g_cameras.shape) if half is None else coupling.to_cameras(T, half)
-    return Iterated(coupling, normal.U, ties, T, white, lam), right
+    if all(own.coupling.direct for own in kinds):
+        pairs, right = kinds[0].coupling.schur(*kinds[0][1:])
+        for own in kinds[1:]:
+            more, rest = own.coupling.schur(*own[1:])
+            pairs, right = pairs.plus(more), right + rest
+        return Bordered(pairs, U, ties, white, lam), right
+    right = np.zeros(U.shape[:2])
+    for own in kinds:
+        if own.half is not None:
+            right = right + own.coupling.to_cameras(own.T, own.half)
+    coupling: Any = kinds[0].coupling if len(kinds) == 1 else _Sum(kinds)
+    return Iterated(coupling, U, ties, kinds[0].T, white, lam), right
+
+
+class _Sum:
+    """The couplings of all kinds of features as `Iterated` asks for one; it holds their roots."""
+
+    def __init__(self, kinds: Sequence[Eliminated]) -> None:
+        self._kinds = kinds
+
+    def diagonal(self, _: Array) -> Array:
+        """Return the diagonal blocks of what all kinds take off, (n, d, d)."""
+        return np.asarray(sum(own.coupling.diagonal(own.T) for own in self._kinds))
+
+    def to_points(self, _: Array, x: Array) -> list[Array]:
+        """Return T^T W^T x of each kind."""
+        return [own.coupling.to_points(own.T, x) for own in self._kinds]
+
+    def to_cameras(self, _: Array, halves: list[Array]) -> Array:
+        """Return the sum of W T half."""
+        pairs = zip(self._kinds, halves, strict=True)
+        return np.asarray(sum(own.coupling.to_cameras(own.T, half) for own, half in pairs))
 
 
 class Bordered:

@@ -82,14 +82,16 @@ def bundle_problem(
     whitening : ndarray, shape (2, 2, N), optional
         What residuals are multiplied by.
     **parts
-        Other parts of a `BundleProblem`: freedom, priors.
+        Other parts of a `BundleProblem`: freedom, priors, kinds.
     """
     retract = model.kernel("retract", kernels.name)
     how = REFINEMENT_METRIC if model.metric else REFINEMENT
     ties = parts["freedom"].ties if "freedom" in parts else None
+    seen = [kind.graph for kind in parts.get("kinds", ())]
+    measured = graph, q, weights, loss or Loss()
     return BundleProblem(
         model,
-        linearizer_for(model, kernels, graph, q, weights, loss or Loss(), workers, ties, whitening),
+        linearizer_for(model, kernels, *measured, workers, ties, whitening, seen),
         lambda cameras, own: np.ascontiguousarray(retract(cameras.T, own.T).T),
         refinement=how if embedded else None,
         floor=0.5 * float(np.sum(weights * (_ROUNDING * q) ** 2)),

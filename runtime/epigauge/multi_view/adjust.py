@@ -15,7 +15,7 @@ from epigauge._options import Backend, BundleDamping, GaugeMode, Method, Schedul
 from epigauge._options import Loss as LossName
 from epigauge.bundle.dampings import DAMPINGS
 from epigauge.bundle.jobs import job_of
-from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.observations import ObservationGraph, whitened
 from epigauge.bundle.prior_kinds import Prior, listed_priors
 from epigauge.bundle.refinement import fixed_indices
 from epigauge.bundle.run import checked_gauge, minimized
@@ -27,7 +27,6 @@ from epigauge.multi_view.gauge import Gauge
 from epigauge.multi_view.initialize import initialize
 from epigauge.multi_view.line_adjust import adjusted_lines
 from epigauge.multi_view.line_tracks import LineTracks
-from epigauge.multi_view.measured import whitened
 from epigauge.multi_view.prior_noise import with_estimated_noise
 from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.rejection import without_gross_errors

@@ -11,25 +11,19 @@ from numpy.typing import NDArray
 from epigauge import kernels, lm
 from epigauge._arguments import as_choice, as_positive
 from epigauge.bundle.dampings import DAMPINGS, LAM_FLOOR_METRIC, Covariant
+from epigauge.bundle.diagnosis import diagnosed
 from epigauge.bundle.jobs import Job, metric_job
-from epigauge.bundle.lines import (
-    FeatureLinearizer,
-    FeatureProblem,
-    feature_freedom,
-    features_of,
-    joint_graph,
-    unit_lines,
-)
-from epigauge.bundle.observations import ObservationGraph
-from epigauge.bundle.problem import BundleState, Estimate
-from epigauge.bundle.run import REFINEMENT_METRIC
+from epigauge.bundle.lines import LineLinearizer, unit_lines
+from epigauge.bundle.observations import ObservationGraph, whitened
+from epigauge.bundle.problem import BundleProblem, BundleState, Estimate
+from epigauge.bundle.run import bundle_problem
 from epigauge.bundle.similarity import Similarity, normal_frame
 from epigauge.bundle.solve import BundleSystem
 from epigauge.cameras import MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 from epigauge.multi_view.line_segments import segments_of
-from epigauge.multi_view.line_start import OPEN, ROUNDING, checked_scene, spreads, triangulated
+from epigauge.multi_view.line_start import OPEN, checked_scene, spreads, triangulated
 from epigauge.multi_view.line_tracks import LineTracks
 from epigauge.multi_view.tracks import Tracks
 from epigauge.multi_view.verdicts.front import BEHIND
@@ -49,7 +43,7 @@ class LineJob(NamedTuple):
     """A problem of points and lines about the origin, and the way back."""
 
     job: Job
-    problem: FeatureProblem
+    problem: BundleProblem
     start: Estimate
     home: Similarity
 
@@ -98,40 +92,32 @@ def line_job(
     first = _first_lines(lines, start, table)
     home = normal_frame(job.cameras, job.points)
     cameras, points = home.apply(job.cameras, job.points)
+    begin = Estimate(cameras, points, others=(home.lines(first),))
+    of_lines = LineLinearizer.of(segments, job.model, table, (len(cameras), lines.n_lines))
     graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
-    whitening = job.whitening
-    if whitening is not None:
-        more = np.repeat(np.eye(2)[:, :, None], len(lines), axis=2)
-        whitening = np.concatenate([whitening, more], axis=2)
-    linearizer = FeatureLinearizer(
-        job.model,
-        table,
-        joint_graph(graph, segments, lines.n_lines),
-        job.q,
-        np.concatenate([tracks.weights, np.ones(len(lines))]),
-        Loss(),
-        whitening,
-        segments=segments,
-        n_points=tracks.n_points,
-    )
-    features = features_of(points, home.lines(first))
+    parts = job.model, table, graph, job.q, tracks.weights
+    options: dict[str, Any] = {"whitening": job.whitening, "freedom": job.freedom}
     scale = 0.0
     if loss != "linear":
         if loss_scale_px != "auto":
             scale = as_positive("loss_scale_px", loss_scale_px)
         else:
-            sizes = np.linalg.norm(linearizer.observe(cameras, features)[0], axis=0)
-            scale = EFFICIENT[loss] * max(robust_scale(sizes[linearizer.weights > 0.0]), 1e-12)
-    retract = job.model.kernel("retract", table.name)
-    problem = FeatureProblem(
-        job.model,
-        linearizer.with_loss(Loss(loss, scale)),
-        lambda rows, own: np.ascontiguousarray(retract(rows.T, own.T).T),
-        feature_freedom(job.freedom, tracks.n_points, lines.n_lines),
-        refinement=REFINEMENT_METRIC if embedded else None,
-        floor=0.5 * float(np.sum(tracks.weights * (1e-14 * job.q) ** 2)),
-    )
-    return LineJob(job, problem, Estimate(cameras, features), home), scale
+            problem = bundle_problem(*parts, kinds=(of_lines,), **options)
+            sizes = np.concatenate(_sizes(problem, begin, tracks.whitening))
+            counts = np.concatenate([tracks.weights > 0.0, np.ones(len(lines), np.bool_)])
+            scale = EFFICIENT[loss] * max(robust_scale(sizes[counts]), 1e-12)
+    robust = Loss(loss, scale)
+    kinds = (of_lines.with_loss(robust),)
+    problem = bundle_problem(*parts, robust, embedded=embedded, kinds=kinds, **options)
+    return LineJob(job, problem, begin, home), scale
+
+
+def _sizes(problem: BundleProblem, at: Estimate, whitening: Array | None) -> list[Array]:
+    """Return the length of each residual, whitened: of points, then of lines."""
+    r = problem.linearizer.residuals(at.cameras, at.points)
+    (own,), (lines,) = problem.kinds, at.others
+    parts = whitened(whitening, r), own.residuals(at.cameras, lines)
+    return [np.linalg.norm(part, axis=0) for part in parts]
 
 
 def _first_lines(lines: LineTracks, start: MetricReconstruction, table: Table) -> Array:
@@ -178,56 +164,34 @@ def adjusted_lines(
     except np.linalg.LinAlgError:
         was = f"leaves the steps of method={method!r} undetermined (singular normal equations)"
         raise ArgumentError("start", was, "method='covariant'") from None
-    m, cameras, features = tracks.n_points, outcome.state.cameras, outcome.state.points
-    back = home.inverse()
-    whole = job.result(*back.apply(cameras, features[:m, :3]))
+    reached, back = outcome.state.estimate, home.inverse()
+    whole = job.result(*back.apply(reached.cameras, reached.points))
     assert isinstance(whole, MetricReconstruction)
-    space = unit_lines(back.lines(features[m:]))
+    space = unit_lines(back.lines(reached.others[0]))
     found = MetricReconstruction(whole.R, whole.t, whole.X, whole.cameras, space)
     predicted, depths = found.seen(tracks)
     n_behind = int(np.count_nonzero(~(depths > 0.0)))
     raised = {"behind the cameras"} if n_behind > BEHIND * len(tracks) else set()
-    assert isinstance(problem.linearizer, FeatureLinearizer)
-    r = problem.linearizer.observe(cameras, features)[0]
+    line_fun = problem.kinds[0].residuals(reached.cameras, reached.others[0])
     rank, condition = 0, float("inf")
     system: Any = outcome.system() if callable(outcome.system) else outcome.system
     if isinstance(system, BundleSystem) and np.isfinite(outcome.state.cost):
-        rank, missing, condition = _determined(system, job)
-        weights = problem.linearizer.weights
-        counts = weights > 0.0
-        share = max(1.0 - rank / max(2 * int(np.count_nonzero(counts)), 1), 1e-3)
-        sizes = (np.sqrt(weights) * np.linalg.norm(r, axis=0))[counts]
+        known = np.isin(np.arange(tracks.n_points), np.asarray([*free["fixed_points"]], np.intp))
+        diagnosis = diagnosed(system, table, known, job.fixes_gauge)
+        rank, condition = diagnosis.rank, diagnosis.condition
+        of_points, of_lines = _sizes(problem, reached, tracks.whitening)
+        sizes = np.concatenate([np.sqrt(tracks.weights) * of_points, of_lines])
+        counts = np.concatenate([tracks.weights > 0.0, np.ones(len(lines), np.bool_)])
+        sizes = sizes[counts]
+        share = max(1.0 - rank / max(2 * len(sizes), 1), 1e-3)
         usual = median(sizes) / 1.1774 / float(np.sqrt(share))
         middles = 0.5 * (lines.segments[:, :2] + lines.segments[:, 2:])
         if loss == "linear":
             raised.update(gross_flags(sizes, usual, np.concatenate([tracks.xy, middles])[counts]))
-        if missing:
+        if diagnosis.missing:
             raised.add("undetermined")
-        V = system.normal.V[m:]
-        if (usual * spreads(V) > OPEN).any():
+        if (usual * spreads(system.normal.others[0].V) > OPEN).any():
             raised.add("open lines")
-    line_fun = np.ascontiguousarray(r[:, len(tracks) :].T)
-    fun = tracks.xy - predicted
+    line_fun, fun = np.ascontiguousarray(line_fun.T), tracks.xy - predicted
     flags = ordered(raised)
     return Adjusted(found, outcome, fun, line_fun, flags, rank, n_behind, condition, scale)
-
-
-def _determined(system: BundleSystem, job: Job) -> tuple[int, int, float]:
-    """Return the rank, how many directions of cameras nothing determines, and the condition."""
-    W = Covariant().blocks(system)
-    V = system.V
-    values = np.linalg.eigvalsh(V)
-    open_features = int(np.count_nonzero(values <= ROUNDING * values[:, -1:]))
-    T, _ = system.inverse_roots(V, W.points, 1e-12, system.gradients[2])
-    S = system.reduced(T)
-    size = np.sqrt(np.maximum(np.diagonal(S), 1e-300))
-    frozen = 0 if system.ties.A is None else int(np.count_nonzero(~system.ties.A.any(axis=1)))
-    spectrum = np.linalg.eigvalsh(S / size[:, None] / size)
-    gauge = 0 if job.fixes_gauge else system.model.gauge_dimension
-    if job.fixes_gauge:
-        # What a fixed view or point leaves of the gauge is no fault of the observations.
-        gauge = min(int(np.count_nonzero(spectrum <= ROUNDING)), system.model.gauge_dimension)
-    missing = max(int(np.count_nonzero(spectrum <= ROUNDING)) - gauge, 0)
-    rank = len(S) - frozen - gauge - missing + V.shape[0] * V.shape[1] - open_features
-    least = spectrum[min(gauge + missing, len(spectrum) - 1)]
-    return rank, missing, float(1.0 / max(least, 1e-300)) if not missing else float("inf")

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import kernels
-from epigauge.bundle.lines import FeatureLinearizer, Segments, unit_lines
-from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.lines import LineLinearizer, Segments, unit_lines
 from epigauge.bundle.run import REFINEMENT_METRIC
 from epigauge.bundle.similarity import normal_frame
 from epigauge.cameras import MetricReconstruction, camera_model
@@ -17,7 +16,6 @@ from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 from epigauge.multi_view.line_segments import segments_of
 from epigauge.multi_view.line_tracks import LineTracks
-from epigauge.two_view.losses import Loss
 
 __all__ = ["OPEN", "ROUNDING", "checked_scene", "spreads", "triangulate_lines", "triangulated"]
 
@@ -93,22 +91,11 @@ def triangulated(
     first = unit_lines(_nearest(segments, cameras, lines.n_lines))
     bad = ~np.isfinite(first).all(axis=1)
     first[bad] = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-    # No points: an empty part of the features.
-    alone = ObservationGraph(segments.view, segments.line, len(cameras), lines.n_lines)
-    model = camera_model(reconstruction.cameras.model)
-    linearizer = FeatureLinearizer(
-        model,
-        table,
-        alone,
-        np.zeros((2, 0)),
-        np.ones(len(lines)),
-        Loss(),
-        segments=segments,
-        n_points=0,
-    )
+    model, sizes = camera_model(reconstruction.cameras.model), (len(cameras), lines.n_lines)
+    linearizer = LineLinearizer.of(segments, model, table, sizes)
     refined, _ = linearizer.refine_points(cameras, first, REFINEMENT_METRIC)
     J = linearizer.observe(cameras, refined)[2]
-    deviations = spreads(alone.sum_points(np.einsum("ikn,iln->nkl", J, J)))
+    deviations = spreads(linearizer.graph.sum_points(np.einsum("ikn,iln->nkl", J, J)))
     deviations[bad | ~np.isfinite(refined).all(axis=1)] = np.inf
     return home.inverse().lines(refined), deviations
 

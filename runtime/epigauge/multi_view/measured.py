@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from epigauge._arguments import as_real
 from epigauge.errors import ArgumentError
 
-__all__ = ["measured", "merged_sums", "whitened"]
+__all__ = ["measured", "merged_sums"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -82,14 +82,6 @@ def _split(information: Array) -> tuple[Array, Array]:
     root = np.swapaxes(np.linalg.cholesky(information), 1, 2)
     s = 1.0 / np.sqrt(root[:, 0, 0] * root[:, 1, 1])
     return np.ascontiguousarray((s[:, None, None] * root).transpose(1, 2, 0)), s
-
-
-def whitened(whitening: Array | None, values: Array) -> Array:
-    """Return W times vectors (2, N) or rows of matrices (2, k, N); the same where W is None."""
-    if whitening is None:
-        return values
-    W = whitening if values.ndim == 2 else whitening[:, :, None]
-    return np.asarray(np.stack([np.sum(row * values, axis=0) for row in W]))
 
 
 def merged_sums(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from epigauge.multi_view.measured import whitened
+from epigauge.bundle.observations import whitened
 from epigauge.multi_view.tracks import Tracks
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from epigauge import kernels
 from epigauge._arguments import as_choice, as_positive
 from epigauge._results import Result
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
-from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.observations import ObservationGraph, whitened
 from epigauge.bundle.prior_kinds import Prior
 from epigauge.cameras import (
     AffineReconstruction,
@@ -35,7 +35,6 @@ from epigauge.multi_view.datum import Projector, halves, mapped, projector
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import Gauge, identity, normalized, two_cameras
 from epigauge.multi_view.inverse import Inverse
-from epigauge.multi_view.measured import whitened
 from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.sandwich import Sandwich
 from epigauge.multi_view.tracks import Tracks

@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from epigauge import lm
 from epigauge.bundle.diagnosis import Diagnosis, diagnosed
+from epigauge.bundle.observations import whitened
 from epigauge.bundle.problem import BundleState
 from epigauge.bundle.solve import BundleSystem
 from epigauge.cameras import AffineReconstruction, MetricReconstruction
 from epigauge.kernels import Table
 from epigauge.multi_view.frame import Frame
-from epigauge.multi_view.measured import whitened
 from epigauge.multi_view.tracks import Tracks
 from epigauge.multi_view.verdicts.distant import distance_flags, relative_depths
 from epigauge.multi_view.verdicts.front import BEHIND

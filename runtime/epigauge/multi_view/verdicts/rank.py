@@ -9,7 +9,7 @@ from epigauge.bundle.dampings import Covariant
 from epigauge.bundle.null_space import generators
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.problem import BundleState, Estimate
-from epigauge.bundle.reduced import Bordered, Iterated, reduced_system
+from epigauge.bundle.reduced import Bordered, Eliminated, Iterated, reduced_system
 from epigauge.bundle.run import bundle_problem
 from epigauge.bundle.solve import BundleSystem
 from epigauge.cameras import camera_model
@@ -121,7 +121,7 @@ def _measured(
     else:
         shift = _SHIFT if coupling.direct else _SHIFT_ITERATIVE
         shifted, _ = reduced_system(
-            system.normal, white.ties, T, None, U + shift * np.eye(a), shift
+            [Eliminated(coupling, T)], system.normal.U, white.ties, U + shift * np.eye(a), shift
         )
         columns = _COLUMNS if coupling.direct else 2
         while True:
