@@ -20,6 +20,7 @@ from epigauge.metric.scene import Images, with_all_points
 from epigauge.metric.search import MODELS, Candidate, Fit, Search, metric_of
 from epigauge.multi_view.adjust import BundleResult, bundle_adjust
 from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.rejection import GrossErrors
 from epigauge.multi_view.tracks import MIN_VIEWS, Tracks
 from epigauge.multi_view.uncertainty import covariance
 from epigauge.two_view.losses import median
@@ -31,8 +32,12 @@ __all__ = ["MetricUpgrade", "metric_upgrade"]
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-#: Adjustments at most, each without the points that the one before put behind cameras.
-_ROUNDS = 3
+#: Relative decrease of the cost that ends the adjustment whose residuals only tell gross errors,
+#: and the last ones: of 1e5 observations the latter leaves a few hundredths of a deviation.
+_EARLY, _LATE = 1e-2, 1e-8
+
+#: Last adjustments at most, and the share of the observations that may change sides after them.
+_ROUNDS, _SETTLED = 4, 1e-3
 
 
 @dataclass(frozen=True)
@@ -215,38 +220,45 @@ def metric_upgrade(
         start = with_all_points(start, tracks, images, kernels.table(backend))
     options: Any = {"refine": fit.refined, "workers": workers, "backend": backend}
     try:
-        bundle = _in_front(tracks, start, options)
+        bundle = _adjusted(tracks, start, options, backend)
     except ArgumentError:  # so degenerate that no step can be made
         return _nothing(tracks, images, ("undetermined",))
     return _judged(tracks, images, search, fit, bundle, backend)
 
 
-def _in_front(tracks: Tracks, start: MetricReconstruction, options: Any) -> BundleResult:
+def _adjusted(
+    tracks: Tracks, start: MetricReconstruction, options: Any, backend: str | None
+) -> BundleResult:
     """Return the adjustment without gross errors, and without points behind cameras that see them.
 
-    These agree with the cameras by chance: two of their observations are on epipolar lines. What is
-    set aside is found by adjustments that stop early; the last one, of what is left, does not.
+    These agree with the cameras by chance: two of their observations are on epipolar lines. A
+    robust adjustment that stops early tells what to set aside; the rest is adjusted to the end.
     """
-    weights = np.asarray(tracks.weights)
+    search = GrossErrors(tracks, kernels.table(backend))
+    given = np.asarray(tracks.weights)
+    found = bundle_adjust(tracks, start, loss="cauchy", ftol=_EARLY, **options)
+    aside = _aside(search, found)
     for _ in range(_ROUNDS):
-        rough = bundle_adjust(tracks.weighted(weights), start, robust=True, ftol=1e-4, **options)
-        start = metric_of(rough)
-        weights = np.where(rough.rejected, 0.0, weights)
-        seen_behind = (weights > 0.0) & ~(start.depths(tracks) > 0.0)
-        if not seen_behind.any():
+        kept = tracks.weighted(np.where(aside, 0.0, given))
+        found = bundle_adjust(kept, metric_of(found), ftol=_LATE, **options)
+        before, aside = aside, _aside(search, found)
+        if np.mean(aside != before) < _SETTLED:
             break
-        behind = np.zeros(tracks.n_points, dtype=np.bool_)
-        behind[tracks.point[seen_behind]] = True
-        weights = np.where(behind[tracks.point], 0.0, weights)
-    bundle = bundle_adjust(tracks.weighted(weights), start, ftol=1e-8, **options)
-    ahead = metric_of(bundle).depths(tracks) > 0.0
-    flags = set(bundle.flags) | set(rough.flags)
-    if ahead[weights > 0.0].all():
+    flags = set(found.flags)
+    if (metric_of(found).depths(tracks) > 0.0)[~before & (given > 0.0)].all():
         flags.discard("behind the cameras")
-    rejected = (weights == 0.0) & (tracks.weights > 0.0)
-    count = f"{np.count_nonzero(rejected)} of {len(tracks)}"
-    message = f"{bundle.message}; {count} observations set aside as gross errors"
-    return replace(bundle, rejected=rejected, flags=ordered(flags), message=message)
+    count = f"{np.count_nonzero(before)} of {len(tracks)}"
+    message = f"{found.message}; {count} observations set aside as gross errors"
+    return replace(found, rejected=before, flags=ordered(flags), message=message)
+
+
+def _aside(search: GrossErrors, bundle: BundleResult) -> NDArray[np.bool_]:
+    """Return observations that are gross errors, and those of points behind their cameras."""
+    tracks, found = search.tracks, metric_of(bundle)
+    gross = search.gross(found, bundle.fun)
+    behind = np.zeros(tracks.n_points, dtype=np.bool_)
+    behind[tracks.point[search.counts & ~gross & ~(found.depths(tracks) > 0.0)]] = True
+    return np.asarray(gross | (search.counts & behind[tracks.point]))
 
 
 def _judged(

@@ -326,10 +326,10 @@ def bundle_adjust(
         else:
             predicted, depths = reconstruction.project(tracks), None
         free = fixed, job.fixes_gauge or reference, predicted, loss == "linear"
-        frame = Frame.of(tracks)
 
         def judge() -> Verdict:
-            return judged_metric(tracks, frame, reconstruction, depths, outcome, table, *free)
+            known = Frame.of(tracks), reconstruction, depths, outcome, table, *free
+            return judged_metric(tracks, *known)
 
     else:
         linear = loss == "linear"

@@ -25,7 +25,7 @@ from epigauge.two_view.losses import EFFICIENT, median
 if TYPE_CHECKING:
     from epigauge.multi_view.adjust import BundleResult
 
-__all__ = ["Adjust", "without_gross_errors"]
+__all__ = ["Adjust", "GrossErrors", "without_gross_errors"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -82,7 +82,7 @@ def without_gross_errors(
     BundleResult
         The last adjustment, with what was set aside in `rejected`.
     """
-    search = _Search(tracks, kernels)
+    search = GrossErrors(tracks, kernels)
     typical = np.inf
     for _ in range(_ROBUST_ROUNDS):
         found = adjust(tracks, start, loss="cauchy", loss_scale_px="auto")
@@ -115,8 +115,16 @@ def _told(message: str, rejected: Mask) -> str:
     return f"{message}; {share if count else 'nothing set aside'}"
 
 
-class _Search:
-    """Tracks, and what is asked of them again and again."""
+class GrossErrors:
+    """Tracks, and which of their observations are gross errors of a reconstruction.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Observations.
+    kernels : Table
+        Backend.
+    """
 
     def __init__(self, tracks: Tracks, kernels: Table) -> None:
         self.tracks, self.frame = tracks, Frame.of(tracks)
@@ -125,10 +133,11 @@ class _Search:
         q, weights = self.frame.conditioned(tracks), np.asarray(tracks.weights)
         self.parts = kernels, graph, q, weights
 
-    def distances(self, found: Any) -> Array:
-        """Return the distance of each observation, (N,),  times the root of its weight."""
+    def distances(self, found: Any, fun: Array | None = None) -> Array:
+        """Return the distance of each observation, (N,), times the root of its weight."""
         with np.errstate(invalid="ignore", over="ignore"):
-            d = np.linalg.norm(self.tracks.xy - found.project(self.tracks), axis=1)
+            fun = self.tracks.xy - found.project(self.tracks) if fun is None else fun
+            d = np.sqrt(fun[:, 0] ** 2 + fun[:, 1] ** 2)
         return np.asarray(np.nan_to_num(np.sqrt(self.tracks.weights) * d, nan=np.inf))
 
     def typical(self, found: Any) -> float:
@@ -146,9 +155,22 @@ class _Search:
         P = self.frame.cameras_in(found.P)
         return Reconstruction(found.P, agreed_points(*self.parts, P, found.Q, scale))
 
-    def gross(self, found: Any) -> Mask:
-        """Return which observations are gross errors, or all that is left of a point to one."""
-        distances = self.distances(found)
+    def gross(self, found: Any, fun: Array | None = None) -> Mask:
+        """Return which observations are gross errors, or all that is left of a point to one.
+
+        Parameters
+        ----------
+        found : Reconstruction or MetricReconstruction
+            Cameras and points.
+        fun : ndarray, shape (N, 2), optional
+            Its residuals, where they are known.
+
+        Returns
+        -------
+        ndarray of bool, shape (N,)
+            Those beyond six standard deviations of the noise.
+        """
+        distances = self.distances(found, fun)
         limit = _GROSS * max(median(distances[self.counts]) / _MEDIAN, 1e-12 * self.frame.scale)
         gross = self.counts & ((distances > limit) | self._at_centre(found))
         kept = self.counts & ~gross

@@ -80,7 +80,6 @@ class MetricCovariance(GaugeFree, Result):
     gauge: Any
     open: int
     _inverse: Inverse | Sandwich
-    _projection: Projection
     _home: Similarity
     _rows: tuple[Array, Array]
 
@@ -109,8 +108,14 @@ class MetricCovariance(GaugeFree, Result):
         MetricCovariance
             In the datum; the reconstruction is the same.
         """
-        there = projection(gauge, *self._rows, self._inverse)
-        return replace(self, gauge=gauge, _projection=there)
+        there = replace(self, gauge=gauge)
+        _ = there._projection  # raises where the datum is none
+        return there
+
+    @cached_property
+    def _projection(self) -> Projection:
+        """What takes the inverse to the datum; intrinsics do without."""
+        return projection(self.gauge, *self._rows, self._inverse)
 
     def camera(self, i: int) -> Array:
         """Return the covariance of the small rotation and the centre of a view.
@@ -223,7 +228,8 @@ class MetricCovariance(GaugeFree, Result):
         """
         first, second = self._part("a", a), self._part("b", b)
         block = self._inverse.block(first.part, second.part)
-        block = block + self._low(first) @ self._projection.M @ self._low(second).T
+        if first.moves or second.moves:  # intrinsics alone are the same in every datum
+            block = block + self._low(first) @ self._projection.M @ self._low(second).T
         return np.asarray(self.noise_px**2 * first.out @ block @ second.out.T)
 
     def joint(self, parts: Sequence[tuple[str, int]]) -> Array:
@@ -301,7 +307,7 @@ class MetricCovariance(GaugeFree, Result):
         if kind == "camera":
             return _Part((index, None), np.pad(self._poses[index], ((0, 0), (0, d - _POSE))))
         first = int(np.argmax(cameras.camera_of_view == index))
-        return _Part((first, None), np.eye(d)[_POSE:])
+        return _Part((first, None), np.eye(d)[_POSE:], moves=False)
 
 
 def _roots(blocks: Array) -> Array:
@@ -315,3 +321,5 @@ class _Part:
 
     part: Part
     out: Array
+    #: Whether motions of the gauge move it.
+    moves: bool = True

@@ -301,6 +301,16 @@ class Inverse:
             x, y = x + self.L_cameras @ small, y + self.L_points @ small
         return x, y
 
+    def forms(self, cameras: Array, points: Array) -> Array:
+        """Return c^T X c of each column c, (n, d, k) and (m, b, k) -> (k,)."""
+        own = self.V_inverse @ points
+        right = cameras - self.coupling.to_cameras(None, own)
+        found = np.sum(right * self.solved(right), axis=(0, 1)) + np.sum(points * own, axis=(0, 1))
+        if self.M.size:
+            small = products((self.L_cameras, self.L_points), (cameras, points))
+            found = found + np.sum(small * (self.M @ small), axis=0)
+        return np.asarray(found)
+
     @property
     def graph(self) -> ObservationGraph:
         """The observations, one edge a pair of view and point."""

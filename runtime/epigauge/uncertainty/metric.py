@@ -24,7 +24,6 @@ from epigauge.errors import ArgumentError
 from epigauge.multi_view.tracks import Tracks
 from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
 from epigauge.uncertainty.covariance import MetricCovariance
-from epigauge.uncertainty.datum import projection
 from epigauge.uncertainty.influence import RobustFit
 from epigauge.uncertainty.inverse import Inverse, Motions
 from epigauge.uncertainty.sandwich import Difference, Sandwich, pull
@@ -101,17 +100,18 @@ def metric_covariance(
         if redundancy <= 0:
             raise ArgumentError("noise_px", "is not given", "a number: nothing is redundant")
         noise_px = float(np.sqrt(2.0 * cost / redundancy))
-    return MetricCovariance(
+    found = MetricCovariance(
         reconstruction,
         noise_px,
         redundancy,
         gauge,
         inverse.motions.open.shape[1],
         whole,
-        projection(gauge, cameras, points, whole),
         home,
         (cameras, points),
     )
+    # The usual datum can wait until it is asked for.
+    return found if isinstance(gauge, str) and gauge == "inner" else found.in_gauge(gauge)
 
 
 def redundancy_of(tracks: Tracks, job: Job, motions: Motions) -> int:

@@ -132,8 +132,7 @@ class _Observed:
             columns[v, :, k] = np.einsum("idk,ik->d", self.A[..., rows], forces[:, rows])
             # A view sees a point once: nothing is added twice.
             points[point[rows], :, k] = np.einsum("idk,ik->kd", self.B[..., rows], forces[:, rows])
-        x, y = self.inverse.apply(columns, points)
-        leverage = np.einsum("ndk,ndk->k", columns, x) + np.einsum("mdk,mdk->k", points, y)
+        leverage = self.inverse.forms(columns, points)
         free = np.maximum(by_view[self.chosen] - leverage, 0.0).sum()
         share = by_view[self.chosen].sum() / max(by_view.sum(), 1e-300)
         return float(np.sum(d**2)), float(free / max(share, 1e-300)), np.asarray(by_view, float)
