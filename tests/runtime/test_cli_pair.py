@@ -156,7 +156,7 @@ def test_bad_images_end_with_2_and_one_line(run, photos, tmp_path, name, words) 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--plot", "a.pdf"], "a name ending in .png, .svg, .html"),
+        (["--plot", "a.gif"], "a name ending in .png, .pdf, .svg, .html"),
         (["--plot", "absent/a.html"], "absent: No such file or directory"),
         (["-o", "a.csv"], "a name ending in .npz, .json"),
         (["--detector", "surf"], "detector is 'surf'"),

@@ -6,6 +6,7 @@ import dataclasses
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from itertools import combinations
 
 import epigauge as eg
 import numpy as np
@@ -97,7 +98,32 @@ def test_epipole_at_infinity_is_said_to_be_there() -> None:
     x1 = np.random.default_rng(2).uniform(0, 500, (20, 2))
     x2 = x1 + np.random.default_rng(3).uniform((5, -0.3), (90, 0.3), (20, 2))
     figure = plot_refinement(dataclasses.replace(RESULT, F=rectified), x1, x2)
-    assert figure.axes[0].get_title("right") == "epipole at infinity, 0.0\N{DEGREE SIGN}"
+    assert figure.axes[0].get_title("left") == "Image 1\nepipole at infinity, 0.0\N{DEGREE SIGN}"
+
+
+@pytest.mark.parametrize("shape", [(0.08, 1.0), (1.0, 1.0), (1.0, 0.1)])
+def test_titles_do_not_overlap_with_few_points(shape) -> None:
+    x1, x2 = SCENE.x1[:9] * shape, SCENE.x2[:9] * shape
+    figure = plot_refinement(eg.refine_fundamental(x1, x2), x1, x2)
+    figure.draw_without_rendering()
+    texts = [figure._suptitle, *(axes._left_title for axes in figure.axes)]
+    texts += [axes._right_title for axes in figure.axes if axes.get_title("right")]
+    boxes = [text.get_window_extent() for text in texts]
+    assert [(a, b) for a, b in combinations(boxes, 2) if a.overlaps(b)] == []
+    assert all(box.x1 <= figure.bbox.x1 for box in boxes)
+
+
+def test_curves_that_coincide_take_turns() -> None:
+    tracks = eg.multi_view_scene(0.1).tracks
+    axes = eg.compare(tracks, ["levenberg", "mclauchlan", "covariant"]).plot().axes[0]
+    drawn = {line.get_label(): line for line in axes.lines}
+    same = drawn["_levenberg"], drawn["_mclauchlan"]
+    np.testing.assert_allclose(*(np.log10(line.get_ydata()[:5]) for line in same), atol=0.05)
+    patterns = [line._unscaled_dash_pattern for line in same]
+    assert patterns[0][1] == patterns[1][1]  # as long, and one where the other is not
+    assert patterns[1][0] - patterns[0][0] == patterns[0][1][0]
+    assert same[0].get_markersize() > same[1].get_markersize()
+    assert not drawn["_covariant"].is_dashed()
 
 
 def test_every_evaluation_is_drawn_as_accepted_or_rejected() -> None:
@@ -164,18 +190,20 @@ def test_unusable_pictures_are_refused(arguments, words) -> None:
 
 def test_saved_picture_is_what_its_suffix_says_and_always_the_same(tmp_path) -> None:
     contents = {}
-    for name in ("a.png", "b.png", "a.svg", "b.svg"):
+    for name in ("a.png", "b.png", "a.svg", "b.svg", "a.pdf", "b.pdf"):
         save_figure(plot_refinement(RESULT, SCENE.x1, SCENE.x2), tmp_path / name)
         contents[name] = (tmp_path / name).read_bytes()
     assert contents["a.png"].startswith(b"\x89PNG\r\n")
     assert ET.fromstring(contents["a.svg"]).tag.endswith("svg")
     assert contents["a.png"] == contents["b.png"]
     assert contents["a.svg"] == contents["b.svg"]
+    assert contents["a.pdf"].startswith(b"%PDF")
+    assert contents["a.pdf"] == contents["b.pdf"]
 
 
-@pytest.mark.parametrize("name", ["a.pdf", "a.jpg", "a", ".png"])
+@pytest.mark.parametrize("name", ["a.gif", "a.jpg", "a", ".png"])
 def test_other_forms_are_refused(tmp_path, name) -> None:
-    with pytest.raises(ArgumentError, match=r"a name ending in \.png, \.svg"):
+    with pytest.raises(ArgumentError, match=r"a name ending in \.png, \.pdf, \.svg"):
         save_figure(plot_refinement(RESULT, SCENE.x1, SCENE.x2), tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 

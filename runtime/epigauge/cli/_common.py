@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import errno
 import functools
 import logging
 import os
@@ -24,7 +23,6 @@ import epigauge as eg
 from epigauge import verdicts
 from epigauge._results import SCHEMA
 from epigauge.errors import EpigaugeError
-from epigauge.io._common import check_suffix
 from epigauge.io.output import json_text, plain
 
 P = ParamSpec("P")
@@ -108,17 +106,6 @@ def given(path: Path) -> Path:
     copied = Path(folder, f"stdin{form}")
     copied.write_bytes(content)
     return copied
-
-
-def check_target(path: Path, *suffixes: str) -> None:
-    """Check what a run that may be long will write, before it starts."""
-    suffix = check_suffix(path, *suffixes)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
-    if suffix in (".png", ".svg"):
-        from epigauge.plots._style import need_matplotlib
-
-        need_matplotlib()
 
 
 def write_json(document: dict[str, Any]) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -23,7 +21,6 @@ from epigauge.cli._common import (
     DONE,
     INTERRUPTED,
     NOT_CONVERGED,
-    check_target,
     choice,
     console,
     facts,
@@ -33,6 +30,7 @@ from epigauge.cli._common import (
 )
 from epigauge.cli._live import watching
 from epigauge.cli._tables import save_residuals
+from epigauge.cli._targets import PICTURES, Targets, check_folder, check_target, save_drawing
 from epigauge.errors import ArgumentError
 from epigauge.io import SceneSource, load_scene, plain, save_ply, save_scene
 from epigauge.io._npz_scene import write_npz_scene
@@ -61,14 +59,6 @@ FixView = Annotated[
 ]
 Rigs = Annotated[
     _Rigs, choice(_Rigs, "Poses of a COLMAP folder's rigs; to keep them, they must fit.")
-]
-ImageSize = Annotated[
-    tuple[int, int] | None,
-    typer.Option(
-        metavar="W H",
-        help="Size of a BAL file's images, for -o FOLDER (COLMAP).",
-        show_default=False,
-    ),
 ]
 
 
@@ -142,16 +132,15 @@ class SceneJob:
     def run(
         self,
         options: Mapping[str, Any],
-        plots: Sequence[Path],
-        outputs: Sequence[Path],
+        plot: Sequence[Path] | None,
+        output: Sequence[Path] | None,
         json: bool,
         precision: Path | None = None,
     ) -> int:
         """Adjust the scene and write what is asked for; return the exit code."""
-        for path in outputs:
-            self._check_target(path)
+        targets = Targets(plot, output, json=json, check=self._check_target)
         if precision is not None:
-            check_target(precision, ".png", ".svg")
+            check_target(precision, *PICTURES)
         options = dict(options)
         adjust: Callable[..., eg.BundleResult] = options.pop("adjust")
         out = console()
@@ -167,16 +156,14 @@ class SceneJob:
                 **options,
             )
         answer = _SceneAnswer(self, result, time.perf_counter() - begin, str(options["loss"]))
-        for path in outputs:
-            answer.save(path)
-        for path in plots:
-            answer.draw(path)
+        targets.save(answer.save)
+        targets.draw(answer.draw)
         if precision is not None:
             answer.draw_precision(precision)
         if json:
             write_json(answer.document())
         else:
-            for row in answer.scene.vectors:
+            for row in () if targets.on_stdout else answer.scene.vectors:
                 typer.echo(" ".join(f"{value:.17g}" for value in row))
             answer.report(out, watch.interrupted)
         if watch.interrupted:
@@ -194,8 +181,7 @@ class SceneJob:
 
     def _check_target(self, path: Path) -> None:
         """Check what a run that may be long will write, before it starts."""
-        if not path.parent.is_dir():
-            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
+        check_folder(path)
         if path.suffix.lower() in (".ply", ".csv"):
             return
         if self.start.cameras.model == "bal" and not (self.image_size or is_scene_file(path)):
@@ -308,12 +294,13 @@ class _SceneAnswer:
 
     def draw_precision(self, path: Path) -> None:
         """Draw how sure it is."""
-        from epigauge.plots import plot_precision, save_figure
+        from epigauge.plots import plot_precision
 
         if isinstance(self.covariance, ArgumentError):
             raise self.covariance
         tracks, title = self.job.tracks, named(self.job.path)
-        save_figure(plot_precision(self.covariance, tracks, title, frame=self.frame), path)
+        figure = plot_precision(self.covariance, tracks, title, frame=self.frame)
+        save_drawing(path, figure, title, self.covariance)
 
     def report(self, out: Console, interrupted: bool) -> None:
         """Tell people on stderr what came out."""

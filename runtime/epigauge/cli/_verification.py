@@ -17,6 +17,7 @@ from rich.table import Table
 from epigauge._options import Backend
 from epigauge.cli._common import BAD_INPUT, DONE, console, facts, shown, write_json
 from epigauge.cli._database import ROWS, name_of, progress, save_pairs
+from epigauge.cli._targets import Targets
 from epigauge.colmap import CONFIGS, DatabaseVerification, verify_database
 
 _GENERAL = (2, 3)
@@ -28,7 +29,7 @@ def verify(
     backup: bool,
     workers: int,
     backend: Backend | None,
-    output: Path | None,
+    targets: Targets,
     json: bool,
 ) -> int:
     """Verify the raw matches of a database; return the exit code."""
@@ -45,14 +46,13 @@ def verify(
         )
     seconds = time.perf_counter() - begin
     rows = [_row(result, k) for k in range(len(result))]
-    if output is not None:
-        save_pairs(output, result, rows)
+    targets.save(lambda path: save_pairs(path, result, rows))
     if json:
         facts_ = {"stored": int(result.stored.sum()), "backup": result.backup}
         more = {"already": result.already, "pairs": rows}
         write_json({"source": str(database), "seconds": seconds} | facts_ | more)
     else:
-        for k in np.flatnonzero(np.isin(result.config, _GENERAL)):
+        for k in [] if targets.on_stdout else np.flatnonzero(np.isin(result.config, _GENERAL)):
             numbers = " ".join(f"{value:.17g}" for value in result.F[k].ravel())
             typer.echo(f"{result.image_id[k, 0]} {result.image_id[k, 1]} {numbers}")
         _report(out, result, database, seconds)

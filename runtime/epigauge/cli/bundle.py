@@ -30,7 +30,6 @@ from epigauge.cli._common import (
     INTERRUPTED,
     NOT_CONVERGED,
     Json,
-    check_target,
     choice,
     console,
     facts,
@@ -42,7 +41,6 @@ from epigauge.cli._common import (
 from epigauge.cli._live import watching
 from epigauge.cli._scenes import (
     FixView,
-    ImageSize,
     Refine,
     Rigs,
     SceneJob,
@@ -50,6 +48,7 @@ from epigauge.cli._scenes import (
     save_cloud,
 )
 from epigauge.cli._tables import save_residuals
+from epigauge.cli._targets import ImageSize, Plot, Targets, outputs
 from epigauge.errors import ArgumentError, FileFormatError, MissingPackageError
 from epigauge.io import (
     TrackFile,
@@ -97,7 +96,9 @@ TracksFile = Annotated[
 
 Precision = Annotated[
     Path | None,
-    typer.Option(help="Of a scene: draw sigma of intrinsics and maps of precision, PNG or SVG."),
+    typer.Option(
+        help="Of a scene: draw sigma of intrinsics and maps of precision: PNG, PDF, SVG or HTML."
+    ),
 ]
 
 
@@ -123,17 +124,12 @@ def bundle(
     init: Init = "auto",
     start: Start = None,
     backend: Backend = None,
-    plot: Annotated[
-        list[Path] | None,
-        typer.Option(help="Draw a picture: PNG or SVG; or write a page to turn it: HTML."),
-    ] = None,
+    plot: Plot = None,
     output: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--output",
-            "-o",
-            help="NPZ: everything. PLY: a cloud to look at. CSV: residual of each observation, and "
-            "whether it was set aside. Of scenes: any form.",
+        outputs(
+            "Save NPZ: everything; PLY: a cloud to look at; CSV: residual of each observation, and "
+            "whether it was set aside; of scenes: any form, as below."
         ),
     ] = None,
     colmap: Annotated[
@@ -169,7 +165,6 @@ def bundle(
     cameras where that fails, and minimises the reprojection error in a
     projective basis. Writes the cameras to stdout, one
     line of 12 numbers each, row by row; with --json everything known.
-    --plot and -o may be given several times.
 
     A scene is a COLMAP folder, an NPZ file of `eg.save_scene` or, with
     --refine or --image-size, a BAL file: it has calibrated cameras and points
@@ -183,7 +178,7 @@ def bundle(
     Ctrl-C stops after the evaluation being done: the best estimate so far is
     reported and saved as asked, with exit code 130.
     """
-    plots, outputs, tracks = plot or [], output or [], given(tracks)
+    tracks = given(tracks)
     if refine is not None or image_size is not None or is_scene(tracks):
         others = {"gauge": gauge, "start": start, "colmap": colmap, "clean": clean or None}
         asked: dict[str, Any] = {
@@ -196,14 +191,11 @@ def bundle(
         refuse_options(others)
         asked["adjust"] = adjuster(scheduler)
         scene = SceneJob(tracks, refine, fix_view or [], rigs, y_up, image_size)
-        return scene.run(asked, plots, outputs, json, precision)
+        return scene.run(asked, plot, output, json, precision)
     if precision is not None:
         was = "is given with tracks, whose cameras are not calibrated"
         raise ArgumentError("--precision", was, "a scene")
-    for path in plots:
-        check_target(path, ".png", ".svg", ".html")
-    for path in outputs:
-        check_target(path, ".npz", ".ply", ".csv")
+    targets = Targets(plot, output, (".npz", ".ply", ".csv"), json=json)
     out = console()
     file = load_track_file(tracks, clean, prune=repeated if prune else None)
     begin = time.perf_counter()
@@ -228,15 +220,13 @@ def bundle(
     if y_up is None:
         y_up = tracks.suffix.lower() not in _Y_DOWN
     answer = _Answer(result, file, tracks, y_up, seconds)
-    for path in outputs:
-        answer.save(path)
-    for path in plots:
-        answer.draw(path)
+    targets.save(answer.save)
+    targets.draw(answer.draw)
     refused = None if colmap is None else answer.save_colmap(colmap)
     if json:
         write_json(answer.document())
     else:
-        for P in result.reconstruction.P:
+        for P in () if targets.on_stdout else result.reconstruction.P:
             typer.echo(" ".join(f"{value:.17g}" for value in P.ravel()))
         answer.report(out, watch.interrupted)  # last: many cameras would scroll it away
     if watch.interrupted:

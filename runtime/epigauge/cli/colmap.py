@@ -19,7 +19,6 @@ from epigauge.cli._common import (
     BAD_INPUT,
     DONE,
     Json,
-    check_target,
     choice,
     console,
     facts,
@@ -27,6 +26,7 @@ from epigauge.cli._common import (
     write_json,
 )
 from epigauge.cli._database import ROWS, name_of, progress, save_pairs
+from epigauge.cli._targets import Targets, outputs
 from epigauge.cli._verification import verify
 from epigauge.colmap import DatabaseResult, refine_database
 from epigauge.errors import ArgumentError
@@ -55,9 +55,7 @@ def colmap(
             help="Verify the raw matches; with --write, store what each pair is.",
         ),
     ] = False,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Save all pairs: CSV, or NPZ with more.")
-    ] = None,
+    output: Annotated[list[Path] | None, outputs("Save all pairs: CSV, or NPZ with more.")] = None,
     json: Json = False,
 ) -> int:
     """Refine the fundamental matrix of every verified pair of a COLMAP database.
@@ -72,12 +70,11 @@ def colmap(
     general motion. With --write, what each pair is, its inliers and its F, E and H
     are stored; a second run goes on where the first one was stopped.
     """
-    if output is not None:
-        check_target(output, ".csv", ".npz")
+    targets = Targets(None, output, (".csv", ".npz"), json=json)
     if from_matches:
         if loss != "linear" or max_iter != _MAX_ITER:
             raise ArgumentError("--from-matches", "takes no --loss or --max-iter", "it alone")
-        return verify(database, write, backup, workers, backend, output, json)
+        return verify(database, write, backup, workers, backend, targets, json)
     out = console()
     begin = time.perf_counter()
     with progress(out, not json) as callback:
@@ -92,14 +89,13 @@ def colmap(
             backend=backend,
         )
     seconds = time.perf_counter() - begin
-    if output is not None:
-        save_pairs(output, result, [_row(result, k) for k in range(len(result))])
+    rows = [_row(result, k) for k in range(len(result))]
+    targets.save(lambda path: save_pairs(path, result, rows))
     if json:
-        rows = [_row(result, k) for k in range(len(result))]
         counts = {"stored": int(result.stored.sum()), "backup": result.backup}
         write_json({"source": str(database), "seconds": seconds} | counts | {"pairs": rows})
     else:
-        for k in np.flatnonzero(~np.isnan(result.rms_px)):
+        for k in [] if targets.on_stdout else np.flatnonzero(~np.isnan(result.rms_px)):
             numbers = " ".join(f"{value:.17g}" for value in result.F[k].ravel())
             typer.echo(f"{result.image_id[k, 0]} {result.image_id[k, 1]} {numbers}")
         _report(out, result, database, seconds)

@@ -18,7 +18,6 @@ from epigauge.cli._common import (
     INTERRUPTED,
     NOT_CONVERGED,
     Json,
-    check_target,
     console,
     given,
     named,
@@ -27,6 +26,7 @@ from epigauge.cli._common import (
 )
 from epigauge.cli._live import watching
 from epigauge.cli._scenes import FixView, Refine, SceneJob, refuse_options
+from epigauge.cli._targets import Plot, Targets, outputs, save_drawing
 from epigauge.cli.bundle import (
     Backend,
     Clean,
@@ -55,7 +55,10 @@ def compare(
     init: Init = "auto",
     start: Start = None,
     backend: Backend = None,
-    plot: Annotated[Path | None, typer.Option(help="Draw the convergence: PNG or SVG.")] = None,
+    plot: Plot = None,
+    output: Annotated[
+        list[Path] | None, outputs("Save all that was measured: NPZ or JSON.")
+    ] = None,
     markdown: Annotated[
         bool, typer.Option("--markdown", help="Write the table to stdout as Markdown.")
     ] = False,
@@ -71,8 +74,7 @@ def compare(
     is reported, with exit code 130.
     """
     tracks = given(tracks)
-    if plot is not None:
-        check_target(plot, ".png", ".svg")
+    targets = Targets(plot, output, json=json)
     out = console()
     observed: TrackFile | SceneJob
     if refine is not None or is_scene(tracks):
@@ -91,10 +93,9 @@ def compare(
         comparison = eg.compare(
             observed.tracks, chosen, first, on_method=watch.begin, callback=watch, **options
         )
-    if plot is not None:
-        from epigauge.plots import save_figure
-
-        save_figure(comparison.plot(named(tracks)), plot)
+    title = named(tracks)
+    targets.save(lambda path: comparison.save(path, source=str(tracks)))
+    targets.draw(lambda path: save_drawing(path, comparison.plot(title), title, comparison))
     if json:
         write_json(
             {

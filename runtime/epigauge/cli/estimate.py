@@ -11,8 +11,9 @@ import typer
 
 import epigauge as eg
 from epigauge._options import Backend, FrontEnd
-from epigauge.cli._common import Json, check_target, choice, given
-from epigauge.cli.refine import FROM_FILE, finish, warn_of_marks
+from epigauge.cli._common import Json, choice, given
+from epigauge.cli._targets import ImageSize, Plot, Targets, outputs
+from epigauge.cli.refine import FROM_FILE, finish, of_size, warn_of_marks
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import load_matches
 
@@ -41,12 +42,9 @@ def estimate(
     inliers: Annotated[
         bool, typer.Option("--inliers", help="Use only the matches the file marks as inliers.")
     ] = False,
-    plot: Annotated[
-        Path | None, typer.Option(help="Draw a picture of the inliers: PNG or SVG.")
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Save the whole result: NPZ or JSON.")
-    ] = None,
+    image_size: ImageSize = None,
+    plot: Plot = None,
+    output: Annotated[list[Path] | None, outputs("Save the whole result: NPZ or JSON.")] = None,
     json: Json = False,
 ) -> int:
     """Find the fundamental matrix of a file of raw matches, wrong ones among them.
@@ -56,12 +54,9 @@ def estimate(
     --json everything known about it but the derivatives. A saved NPZ is a file
     of matches too, with the inliers marked: `epigauge refine FILE --inliers`.
     """
-    if plot is not None:
-        check_target(plot, ".png", ".svg")
-    if output is not None:
-        check_target(output, ".npz", ".json")
+    targets = Targets(plot, output, json=json)
     matches = given(matches)
-    pair = load_matches(matches, inliers=inliers)
+    pair = of_size(load_matches(matches, inliers=inliers), image_size)
     warn_of_marks(pair, "which are judged anew")
     begin = time.perf_counter()
     options: dict[str, Any] = {
@@ -83,8 +78,7 @@ def estimate(
     seconds = time.perf_counter() - begin
     kept = int(np.count_nonzero(result.inlier))
     rows = {"matches": f"{len(pair)}, {kept} inliers within {result.threshold_px:.3g} px"}
-    more = {"source": str(matches), "matches": len(pair), "noise_estimated": noise_px is None}
+    more: dict[str, Any] = {"source": str(matches), "matches": len(pair), "noise_estimated": noise_px is None}
     arrays = {"x1": pair.x1, "x2": pair.x2}
-    return finish(
-        result, pair, result.used, more | {"seconds": seconds} | arrays, rows, output, plot, json
-    )
+    more |= {"seconds": seconds} | arrays
+    return finish(result, pair, result.used, more, rows, targets, json)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import time
 from functools import cached_property
 from pathlib import Path
@@ -20,14 +18,15 @@ from epigauge.cli._common import (
     DONE,
     NOT_CONVERGED,
     Json,
-    check_target,
     console,
     facts,
+    given,
     named,
     shown,
     write_json,
 )
 from epigauge.cli._scenes import save_cloud
+from epigauge.cli._targets import Plot, Targets, check_folder, check_target, outputs
 from epigauge.cli.bundle import Backend, Clean, Prune, Repeated, TracksFile
 from epigauge.io import load_track_file, plain, save_scene
 from epigauge.io._npz_scene import write_npz_scene
@@ -41,19 +40,16 @@ def metric(
     tracks: TracksFile,
     image_size: Annotated[
         tuple[float, float],
-        typer.Option(help="Width and height of the images, in pixels.", metavar="W H"),
+        typer.Option(help="Width and height of the images in pixels.", metavar="W H"),
     ],
     output: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--output",
-            "-o",
-            help="A folder: COLMAP model. NPZ: scene with everything known. PLY: a cloud. Several.",
+        outputs(
+            "Save NPZ: scene with everything known; PLY: a cloud to look at; or, without a suffix, "
+            "a folder: COLMAP model."
         ),
     ] = None,
-    plot: Annotated[
-        list[Path] | None, typer.Option(help="A page to turn the scene about: HTML.")
-    ] = None,
+    plot: Plot = None,
     camera: Annotated[str, typer.Option(help="Camera model.")] = "SIMPLE_RADIAL",
     own_cameras: Annotated[
         bool, typer.Option("--own-cameras", help="Each view has a camera of its own.")
@@ -76,11 +72,8 @@ def metric(
     not determine them, with a sentence why; then only what is asked for as JSON
     is written.
     """
-    outputs, plots = output or [], plot or []
-    for path in outputs:
-        _check_output(path)
-    for path in plots:
-        check_target(path, ".html")
+    targets = Targets(plot, output, json=json, check=_check_output)
+    tracks = given(tracks)
     file = load_track_file(tracks, clean, prune=repeated if prune else None)
     begin = time.perf_counter()
     result = eg.metric_upgrade(
@@ -92,13 +85,11 @@ def metric(
     )
     answer = _Answer(result, file.tracks, tracks, time.perf_counter() - begin)
     if result.success:
-        for path in outputs:
-            answer.save(path)
-        for path in plots:
-            answer.draw(path)
+        targets.save(answer.save)
+        targets.draw(answer.draw)
     if json:
         write_json(answer.document())
-    elif result.reconstruction is not None:
+    elif result.reconstruction is not None and not targets.on_stdout:
         for value, std in zip(*answer.focal, strict=True):
             typer.echo(f"{value:.17g} {std:.17g}")
     answer.report(console())
@@ -109,8 +100,8 @@ def _check_output(path: Path) -> None:
     """Check what a run that may be long will write, before it starts."""
     if path.suffix:
         check_target(path, ".npz", ".ply")
-    elif not path.parent.is_dir():
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
+    else:
+        check_folder(path)
 
 
 class _Answer:
@@ -171,15 +162,20 @@ class _Answer:
                 save_scene(path, tracks, scene)
 
     def draw(self, path: Path) -> None:
-        """Write a page."""
-        from epigauge.reports import save_viewer
-
+        """Draw a picture, or write a page."""
         bundle = self.result.bundle
         assert bundle is not None  # of a success
         frame = display(bundle.reconstruction, self.tracks, y_up=False)
-        sure = self.result.covariance
         title = named(self.source)
-        save_viewer(path, bundle, self.tracks, title, frame=frame, covariance=sure)
+        if path.suffix.lower() == ".html":
+            from epigauge.reports import save_viewer
+
+            sure = self.result.covariance
+            save_viewer(path, bundle, self.tracks, title, frame=frame, covariance=sure)
+            return
+        from epigauge.plots import plot_bundle, save_figure
+
+        save_figure(plot_bundle(bundle, self.tracks, title, frame=frame), path)
 
     def report(self, out: Console) -> None:
         """Tell people on stderr what came out."""

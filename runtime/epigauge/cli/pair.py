@@ -17,7 +17,6 @@ from epigauge.cli._common import (
     DONE,
     NOT_CONVERGED,
     Json,
-    check_target,
     choice,
     console,
     facts,
@@ -26,6 +25,7 @@ from epigauge.cli._common import (
     warn,
     write_json,
 )
+from epigauge.cli._targets import Plot, Targets, outputs
 from epigauge.cli.refine import epipoles, standard_deviations
 from epigauge.errors import ArgumentError
 from epigauge.images import ImageMatches, match_images
@@ -70,12 +70,8 @@ def pair(
     max_iter: Annotated[int, typer.Option(help="Trial steps allowed.")] = 100,
     seed: Annotated[int, typer.Option(help="Of the random samples.")] = 0,
     backend: Annotated[Backend | None, choice(Backend, "See `epigauge info`.")] = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="Draw a picture: PNG or SVG; or write a report: HTML.")
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Save the whole result: NPZ or JSON.")
-    ] = None,
+    plot: Plot = None,
+    output: Annotated[list[Path] | None, outputs("Save the whole result: NPZ or JSON.")] = None,
     json: Json = False,
 ) -> int:
     """Find the fundamental matrix of two photographs.
@@ -87,10 +83,7 @@ def pair(
     with --json everything known about it but the derivatives. A saved NPZ is
     a file of matches too: `epigauge refine result.npz --inliers`.
     """
-    if plot is not None:
-        check_target(plot, ".png", ".svg", ".html")
-    if output is not None:
-        check_target(output, ".npz", ".json")
+    targets = Targets(plot, output, json=json)
     os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # of damaged files our own errors tell
     out = console()
     begin = time.perf_counter()
@@ -138,10 +131,8 @@ def pair(
         "noise_estimated": noise_px is None,
         "seconds": seconds,
     }
-    if output is not None:
-        save_result(output, result, **more)
-    if plot is not None:
-        _draw(plot, result, matches, (image1, image2), seconds)
+    targets.save(lambda path: save_result(path, result, **more))
+    targets.draw(lambda path: _draw(path, result, matches, (image1, image2), seconds))
     if json:
         everything = plain(result)
         del everything["jac"]
@@ -151,8 +142,9 @@ def pair(
         title = escape(f"{named(image1)} - {named(image2)}")
         out.print(facts(title, {name: escape(value) for name, value in rows.items()}))
         warn(out, result)
-        for row in result.F:
-            typer.echo(" ".join(f"{value: 24.17g}" for value in row))
+        if not targets.on_stdout:
+            for row in result.F:
+                typer.echo(" ".join(f"{value: 24.17g}" for value in row))
     return DONE if result.success else NOT_CONVERGED
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +19,6 @@ from epigauge.cli._common import (
     DONE,
     NOT_CONVERGED,
     Json,
-    check_target,
     choice,
     console,
     facts,
@@ -27,6 +27,7 @@ from epigauge.cli._common import (
     warn,
     write_json,
 )
+from epigauge.cli._targets import ImageSize, Plot, Targets, outputs, save_drawing
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import Matches, load_matches, plain, save_result
 
@@ -60,10 +61,9 @@ def refine(
     inliers: Annotated[
         bool, typer.Option("--inliers", help="Use only the matches the file marks as inliers.")
     ] = False,
-    plot: Annotated[Path | None, typer.Option(help="Draw a picture: PNG or SVG.")] = None,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Save the whole result: NPZ or JSON.")
-    ] = None,
+    image_size: ImageSize = None,
+    plot: Plot = None,
+    output: Annotated[list[Path] | None, outputs("Save the whole result: NPZ or JSON.")] = None,
     json: Json = False,
 ) -> int:
     """Refine the fundamental matrix of a file of matches.
@@ -72,12 +72,9 @@ def refine(
     Writes F with x2^T F x1 = 0 to stdout, three lines of three numbers; with
     --json everything known about it but the derivatives.
     """
-    if plot is not None:
-        check_target(plot, ".png", ".svg")
-    if output is not None:
-        check_target(output, ".npz", ".json")
+    targets = Targets(plot, output, json=json)
     matches = given(matches)
-    pair = load_matches(matches, inliers=inliers)
+    pair = of_size(load_matches(matches, inliers=inliers), image_size)
     if not inliers:
         warn_of_marks(pair, "which is ignored: --inliers uses only them")
     begin = time.perf_counter()
@@ -102,7 +99,7 @@ def refine(
     rows = {"matches": str(len(pair))}
     more = {"source": str(matches), "matches": len(pair), "noise_estimated": noise_px is None}
     used = np.arange(len(pair))
-    return finish(result, pair, used, more | {"seconds": seconds}, rows, output, plot, json)
+    return finish(result, pair, used, more | {"seconds": seconds}, rows, targets, json)
 
 
 def finish(
@@ -111,8 +108,7 @@ def finish(
     used: NDArray[np.intp],
     more: dict[str, Any],
     rows: dict[str, str],
-    output: Path | None,
-    plot: Path | None,
+    targets: Targets,
     json: bool,
 ) -> int:
     """Save, draw and tell what came out of the matches of a file; return the exit code.
@@ -129,24 +125,35 @@ def finish(
         What else to save and to write as JSON.
     rows : dict of str to str
         First lines of the table for people.
-    output, plot, json
-        The options of the command.
+    targets : Targets
+        What to write.
+    json : bool
+        Whether to write JSON to stdout.
     """
     std_F, std_sigma = standard_deviations(result.F, result.covariance)
     more = more | {"std_F": std_F, "std_sigma": std_sigma, "epipoles": epipoles(result.F)}
-    if output is not None:
-        save_result(output, result, **more)
-    if plot is not None:
-        _draw(plot, result, pair, used)
+    targets.save(lambda path: save_result(path, result, **more))
+    targets.draw(lambda path: _draw(path, result, pair, used, str(more["source"])))
     if json:
         everything = plain(result)
         del everything["jac"]
         write_json(everything | more)
     else:
         _report(result, more, rows)
-        for row in result.F:
-            typer.echo(" ".join(f"{value: 24.17g}" for value in row))
+        if not targets.on_stdout:
+            for row in result.F:
+                typer.echo(" ".join(f"{value: 24.17g}" for value in row))
     return DONE if result.success else NOT_CONVERGED
+
+
+def of_size(pair: Matches, image_size: tuple[int, int] | None) -> Matches:
+    """Return matches that know the size of their images, where it was given."""
+    if image_size is None:
+        return pair
+    if min(image_size) < 1:
+        was = f"is {image_size[0]} {image_size[1]}"
+        raise ArgumentError("--image-size", was, "a width and a height above 0")
+    return replace(pair, image_size1=image_size, image_size2=image_size)
 
 
 def warn_of_marks(pair: Matches, then: str) -> None:
@@ -189,13 +196,15 @@ def epipoles(F: Array) -> list[list[float]]:
         return [(e[:2] / e[2]).tolist() for e in (Vt[2], U[:, 2])]
 
 
-def _draw(path: Path, result: eg.FundamentalResult, pair: Matches, used: NDArray[np.intp]) -> None:
+def _draw(
+    path: Path, result: eg.FundamentalResult, pair: Matches, used: NDArray[np.intp], title: str
+) -> None:
     """Write the picture."""
-    from epigauge.plots import plot_refinement, save_figure
+    from epigauge.plots import plot_refinement
 
     sizes = (pair.image_size1, pair.image_size2)
     figure = plot_refinement(result, pair.x1[used], pair.x2[used], image_sizes=sizes)
-    save_figure(figure, path)
+    save_drawing(path, figure, title, result)
 
 
 def _report(result: eg.FundamentalResult, more: dict[str, Any], rows: dict[str, str]) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from textwrap import wrap
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+#: Letters of a heading that fit over a picture.
+_LETTERS = 112
 GREY, BLUE, RED = "0.45", "#2a6f97", "#c1121f"
 
 
@@ -41,24 +44,25 @@ def heading(figure: Figure, text: str, failure: str = "", flags: Sequence[str] =
     """Write over the picture what was done and, in red, its flags and why it did not converge."""
     text += f"  (not converged: {failure})" if failure else ""
     text += f"\n{', '.join(flags)}" if flags else ""
+    text = "\n".join(line for part in text.splitlines() for line in wrap(part, _LETTERS) or [""])
     colour = RED if failure or flags else "black"
     figure.suptitle(text, x=0.01, ha="left", fontsize=13, color=colour)
 
 
 def save_figure(figure: Figure, path: PathLike) -> None:
-    """Write a picture as PNG or SVG; the same picture gives the same bytes.
+    """Write a picture as PNG, PDF or SVG; the same picture gives the same bytes.
 
     Parameters
     ----------
     figure : matplotlib.figure.Figure
         The picture.
     path : str or path
-        The file; ``.png`` or ``.svg`` chooses the form.
+        The file; ``.png``, ``.pdf`` or ``.svg`` chooses the form.
 
     Raises
     ------
     ArgumentError
-        If the suffix is neither of these.
+        If the suffix is none of these.
     OSError
         If the file cannot be written.
 
@@ -66,12 +70,22 @@ def save_figure(figure: Figure, path: PathLike) -> None:
     --------
     >>> save_figure(result.plot(x1, x2), "refined.png")  # doctest: +SKIP
     """
-    suffix = check_suffix(path, ".png", ".svg")
+    suffix = check_suffix(path, ".png", ".pdf", ".svg")
+    with writing(path) as file:
+        write_figure(figure, file, suffix[1:])
+
+
+def write_figure(figure: Figure, file: IO[bytes], form: str) -> None:
+    """Write a picture without the time and the program that made it."""
     from matplotlib import rc_context
 
-    undated = {"Software": None} if suffix == ".png" else {"Date": None, "Creator": None}
-    with writing(path) as file, rc_context({"svg.hashsalt": "epigauge"}):
-        figure.savefig(file, format=suffix[1:], metadata=undated)
+    undated: dict[str, dict[str, Any]] = {
+        "png": {"Software": None},
+        "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+        "svg": {"Date": None, "Creator": None},
+    }
+    with rc_context({"svg.hashsalt": "epigauge"}):
+        figure.savefig(file, format=form, metadata=undated[form])
 
 
 def draw_history(axes: Axes, history: Sequence[Row]) -> None:

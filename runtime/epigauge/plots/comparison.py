@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from epigauge.bundle.strategies import STRATEGIES
 from epigauge.plots._style import GREY, RED, finish, heading, new_figure
@@ -17,7 +18,13 @@ if TYPE_CHECKING:
 
 __all__ = ["plot_comparison"]
 
+Array = NDArray[np.float64]
+
 _WIDTH = 11.0  # inches
+#: Decades of cost within which two curves are one line to the eye.
+_APART = 0.05
+#: Length of a dash, in line widths.
+_DASH = 3.0
 #: Colour-blind safe (Okabe and Ito) and told apart by markers and dashes, too; one a strategy.
 _LOOKS: dict[str, dict[str, Any]] = {
     name: {"color": colour, "marker": marker, "ls": dashes}
@@ -63,13 +70,16 @@ def plot_comparison(comparison: Comparison, title: str = "") -> Figure:
     >>> plot_comparison(eg.compare(tracks))  # doctest: +SKIP
     """
     figure = new_figure(_WIDTH, 5.6)
+    from matplotlib.ticker import MaxNLocator
+
     heading(figure, "Convergence of the methods" + (f": {title}" if title else ""))
     axes, table = figure.subplots(1, 2, width_ratios=(1.4, 1.0))
     best = min((row.cost for row in comparison.rows if np.isfinite(row.cost)), default=0.0)
     # Below this the costs of two converged runs do not differ by anything but where they stopped.
     floor = max(best * 1e-9, 1e-300)
-    for row in comparison.rows:
-        _draw_method(axes, row, best, floor)
+    curves = [_curve(row, best, floor) for row in comparison.rows]
+    for row, curve, (place, shared) in zip(comparison.rows, curves, _shared(curves), strict=True):
+        _draw_method(axes, row, curve, place, shared)
     axes.axhline(floor, color=GREY, lw=0.8, ls=":")
     axes.annotate(
         "no difference: 10\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT NINE} of the best cost",
@@ -81,6 +91,7 @@ def plot_comparison(comparison: Comparison, title: str = "") -> Figure:
     )
     axes.set(yscale="log", xlabel="evaluations of the cost")
     axes.set(ylabel=f"lowest cost so far, above the best ({_SQUARED_PX})")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     slowest = max(row.nfev for row in comparison.rows)
     if slowest > 30:
         ticks = [tick for tick in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000) if tick <= slowest]
@@ -93,14 +104,44 @@ def plot_comparison(comparison: Comparison, title: str = "") -> Figure:
     return figure
 
 
-def _draw_method(axes: Axes, row: ComparedMethod, best: float, floor: float) -> None:
-    """Draw the lowest cost so far of one method, with a mark where it ended."""
+def _curve(row: ComparedMethod, best: float, floor: float) -> Array:
+    """Return the lowest cost so far of one method, above the best."""
     costs = np.array(
         [np.inf if not r.accepted and i else r.cost for i, r in enumerate(row.history)]
     )
-    above = np.maximum(np.minimum.accumulate(costs) - best, floor)
+    return np.asarray(np.maximum(np.minimum.accumulate(costs) - best, floor))
+
+
+def _shared(curves: list[Array]) -> list[tuple[int, int]]:
+    """Return of each curve which one it is of how many that coincide in the picture."""
+    groups: list[list[int]] = []
+    for k, curve in enumerate(curves):
+        for group in groups:
+            other = curves[group[0]]
+            n = min(len(curve), len(other))
+            if np.abs(np.log10(curve[:n]) - np.log10(other[:n])).max() < _APART:
+                group.append(k)
+                break
+        else:
+            groups.append([k])
+    places = {k: (i, len(group)) for group in groups for i, k in enumerate(group)}
+    return [places[k] for k in range(len(curves))]
+
+
+def _draw_method(
+    axes: Axes, row: ComparedMethod, above: Array, place: int = 0, shared: int = 1
+) -> None:
+    """Draw one method, with a mark where it ended; curves that coincide take turns in dashes.
+
+    Their marks lie in one another, the last one's smallest.
+    """
     at = np.arange(1, len(above) + 1)
     look = _look(row.method)
+    if shared > 1:
+        look |= {"ls": (_DASH * place, (_DASH, _DASH * (shared - 1)))}
+        look |= {"ms": look["ms"] + 2.2 * (shared - 1 - place), "dash_capstyle": "butt"}
+        look |= {"zorder": look["zorder"] + 0.1 * place}
+        look["lw"] = 2.2
     axes.plot(at, above, markevery=max(1, len(above) // 12), label=f"_{row.method}", **look)
     end = {"marker": "o", "ms": look["ms"] + 5, "mfc": "none", "mew": 1.2}
     if not row.success:

@@ -77,6 +77,7 @@ def plot_bundle(
     else:
         caption = "Points and cameras (to look at; no calibration)"
     oblique.set_title(caption, loc="left", fontsize=11)
+    _draw_legend(oblique)
     for row, side, name in ((0, _ABOVE, "From above"), (1, _SIDE, "From the side")):
         axes = figure.add_subplot(grid[row, 4:])
         _draw_scene(axes, shown, side)
@@ -125,6 +126,17 @@ def _draw_scene(axes: Axes, shown: Display, side: Array, floor: bool = False) ->
     axes.set_aspect("equal", adjustable="datalim")
     for spine in axes.spines.values():
         spine.set_color("0.85")
+
+
+def _draw_legend(axes: Axes) -> None:
+    """Say what the colours are."""
+    from matplotlib import colormaps
+
+    dot: dict[str, Any] = {"ls": "", "marker": "o", "ms": 5}
+    for share, name in ((0.0, "near points"), (1.0, "far points")):
+        axes.plot([], [], color=colormaps["viridis"](share), label=name, **dot)
+    axes.plot([], [], color=_CAMERA, lw=1.2, label="cameras")
+    axes.legend(fontsize=8, frameon=False, loc="lower right")
 
 
 def _rims(shown: Display) -> Array:

@@ -81,6 +81,7 @@ def plot_precision(
         axes = figure.add_subplot(grid[1, column])
         _draw_map(axes, shown, usable, sigma, axes_of, norm)
         axes.set_title(name, loc="left", fontsize=11)
+        axes.legend(fontsize=8, frameon=False, loc="upper right")
     axes = figure.add_subplot(grid[1, 2])
     image = _draw_image(axes, tracks, sigma, usable, norm)
     figure.colorbar(image, ax=axes, label="largest sigma of a point (unit of the scene)")
@@ -134,7 +135,7 @@ def _draw_map(
     x, y = shown.points[order][:, axes_of].T
     size = float(np.clip(3000.0 / max(len(order), 1), 1.0, 14.0))
     axes.scatter(x, y, c=sigma[order], norm=norm, cmap="viridis", s=size, lw=0.0)
-    axes.plot(*shown.centres[:, axes_of].T, "^", color=_CAMERA, ms=4.0)
+    axes.plot(*shown.centres[:, axes_of].T, "^", color=_CAMERA, ms=4.0, label="cameras")
     axes.set(xticks=[], yticks=[], facecolor="0.985")
     axes.set_aspect("equal", adjustable="datalim")
 

@@ -141,8 +141,8 @@ def _draw_epipole(axes: Axes, epipole: Array, box: Box, view: int) -> None:
         if box[0] <= x <= box[1] and box[2] <= y <= box[3]:
             axes.plot(x, y, "+", ms=17, mew=4.5, color="white", zorder=5)
             axes.plot(x, y, "+", ms=15, mew=2.0, color="black", zorder=6)
-    axes.set_title(f"Image {view}", loc="left", fontsize=11)
-    axes.set_title(where, loc="right", fontsize=9, color=GREY)
+    # Of few points the image may be narrow: one title over the other, not beside it.
+    axes.set_title(f"Image {view}\n{where}", loc="left", fontsize=10)
 
 
 def _draw_distances(axes: Axes, d: Array) -> None:

@@ -12,8 +12,8 @@ from epigauge.io import writing
 from epigauge.io._common import PathLike
 
 
-def save_page(path: PathLike, name: str, parts: Mapping[str, str], data: Any) -> None:
-    """Write a page: the template ``name.html`` with the script ``name.js`` and data in it.
+def save_page(path: PathLike, name: str, parts: Mapping[str, str], data: Any = None) -> None:
+    """Write a page: the template ``name.html``, with the script ``name.js`` where it has data.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ def save_page(path: PathLike, name: str, parts: Mapping[str, str], data: Any) ->
         Name of template and script in this package.
     parts : mapping of str
         What to put in the places ``$part`` of the template, escaped where it has to be.
-    data : object
+    data : object, optional
         For the script, as JSON: the place ``$data``.
 
     Raises
@@ -31,9 +31,15 @@ def save_page(path: PathLike, name: str, parts: Mapping[str, str], data: Any) ->
     OSError
         If the file cannot be written.
     """
-    # Nothing in a script element is unescaped but its end.
-    text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    here = importlib.resources.files(__package__)
-    page, script = ((here / f"{name}{end}").read_text(encoding="utf-8") for end in (".html", ".js"))
+    own = {"style": _part("page.css")}
+    if data is not None:
+        # Nothing in a script element is unescaped but its end.
+        text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+        own |= {"data": text, "script": _part(f"{name}.js")}
+    page = Template(_part(f"{name}.html"))
     with writing(path) as file:
-        file.write(Template(page).substitute(parts, data=text, script=script).encode())
+        file.write(page.substitute(own | dict(parts)).encode())
+
+
+def _part(name: str) -> str:
+    return (importlib.resources.files(__package__) / name).read_text(encoding="utf-8")

@@ -1,8 +1,14 @@
 "use strict";
 // Points and cameras in space on a plain canvas: 22,000 points are drawn in a few milliseconds.
 
-const RAMP = ["#0d0887", "#46039f", "#7201a8", "#9c179e", "#bd3786", "#d8576b", "#ed7953", "#fb9f3a"];
-const CAMERA = "#c25e00", SEEN = "#2a6f97", GRID = "#e4e7ea", PATH = "#e0a26a";
+// On a dark page the dark end of the ramp would not be seen.
+const DARK = typeof matchMedia === "function" && matchMedia("(prefers-color-scheme: dark)").matches;
+const RAMP = DARK
+  ? ["#6a5cff", "#8a4dff", "#b04be0", "#d14fa8", "#e8637c", "#f5835a", "#fba83f", "#fdd45c"]
+  : ["#0d0887", "#46039f", "#7201a8", "#9c179e", "#bd3786", "#d8576b", "#ed7953", "#fb9f3a"];
+const [PAPER, INK, GRID, CAMERA, SEEN, PATH, SURE] = DARK
+  ? ["#14171a", "#ffffff", "#2b3238", "#ff9a3d", "#6db3dc", "#8a6a48", "#9d9dff"]
+  : ["#ffffff", "#000000", "#e4e7ea", "#c25e00", "#2a6f97", "#e0a26a", "#3b3b8f"];
 const SHADES = 64, FOGS = 5, NEAR = 0.02, SNAP = 12, FIELD = 1.25;
 const AXES = [["x", "#c1121f"], ["y", "#2d6a4f"], ["z", "#2a6f97"]];
 
@@ -23,7 +29,7 @@ function palette() {
   return Array.from({ length: SHADES }, (_, k) => {
     const at = (k / (SHADES - 1)) * (RAMP.length - 1), step = Math.min(Math.floor(at), RAMP.length - 2);
     const pure = mixed(RAMP[step], RAMP[step + 1], at - step);
-    return Array.from({ length: FOGS }, (_, haze) => mixed(pure, "#ffffff", (0.5 * haze) / FOGS));
+    return Array.from({ length: FOGS }, (_, haze) => mixed(pure, PAPER, (0.5 * haze) / FOGS));
   });
 }
 
@@ -235,7 +241,7 @@ function start() {
     };
     by("times").textContent = "\u00d7 " + (times >= 100 ? times.toFixed(0) : times.toPrecision(2));
     pen.globalAlpha = count > 2000 ? 0.25 : 0.55;
-    strokes("#3b3b8f", 0.8, () => { for (let k = 0; k < count; k++) outline([xs[k], ys[k], zs[k]], block("points", k)); });
+    strokes(SURE, 0.8, () => { for (let k = 0; k < count; k++) outline([xs[k], ys[k], zs[k]], block("points", k)); });
     pen.globalAlpha = 0.9;
     if (by("cameras").checked) strokes(CAMERA, 1, () => data.cameras.forEach((camera, k) => outline(project(camera.centre), block("cameras", k))));
     pen.globalAlpha = 1;
@@ -307,7 +313,7 @@ function start() {
     }
     const p = data.points.slice(3 * marked.point, 3 * marked.point + 3);
     strokes(SEEN, 0.9, () => { for (const k of seenBy(marked.point)) line(project, p, data.cameras[k].centre); });
-    strokes("#000000", 1.8, () => { const [x, y] = project(p); pen.arc(x, y, 6, 0, 2 * Math.PI); });
+    strokes(INK, 1.8, () => { const [x, y] = project(p); pen.arc(x, y, 6, 0, 2 * Math.PI); });
   }
 
   function paintAxes() {

@@ -1,0 +1,97 @@
+"""One rule for what commands write: suffix, several, stdout by -, checked before the run."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import epigauge as eg
+import numpy as np
+import pytest
+
+pytest.importorskip("typer", reason="the command line needs typer")
+pytest.importorskip("rich", reason="the command line needs rich")
+
+import commands
+
+Run = Callable[..., tuple[int, str, str]]
+
+#: Commands that write to files named by options.
+WRITERS = {
+    name: command
+    for name, command in commands.commands().items()
+    if any(option.name in ("plot", "output") and option.several for option in command.options)
+}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    for name in ("matches.csv", "raw_matches.csv", "tracks.csv"):
+        (tmp_path / name).write_bytes(eg.samples.path(name).read_bytes())
+    return tmp_path
+
+
+def test_all_commands_say_the_same_of_what_they_write() -> None:
+    assert {"refine", "estimate", "pair", "bundle", "metric", "compare"} <= set(WRITERS)
+    helps = {o.help for c in WRITERS.values() for o in c.options if o.name == "plot"}
+    assert len(helps) == 1
+    for command in WRITERS.values():
+        (output,) = (o for o in command.options if o.name == "output")
+        assert output.help.endswith("Or - for NPZ on stdout. Several.")
+        assert output.flags == ("--output", "-o")
+
+
+@pytest.mark.parametrize("words", [("refine", "matches.csv"), ("compare", "tracks.csv")])
+def test_all_forms_at_once(words: tuple[str, ...], folder: Path) -> None:
+    pytest.importorskip("matplotlib", reason="pictures need Matplotlib")
+    paths = [folder / f"a{form}" for form in (".png", ".pdf", ".svg", ".html", ".npz", ".json")]
+    targets = [
+        word
+        for path in paths
+        for word in ("-o" if path.suffix in (".npz", ".json") else "--plot", path.name)
+    ]
+    methods = ["--methods", "covariant,free"] if words[0] == "compare" else []
+    assert commands.in_process(*words, *methods, *targets).check(0) == []
+    assert [commands.opened(path) for path in paths] == [None] * len(paths)
+
+
+def test_a_result_goes_through_a_pipe() -> None:
+    first = commands.in_process("estimate", "raw_matches.csv", "-o", "-")
+    assert first.check(0) == []
+    with np.load(io.BytesIO(first.out)) as file:
+        F = file["F"]
+    second = commands.in_process("refine", "-", "--inliers", stdin=first.out)
+    assert second.check(0) == []
+    found = np.loadtxt(second.out.decode().splitlines())
+    np.testing.assert_allclose(np.abs(np.sum(found * F)), 1.0, atol=1e-6)
+    (track,) = (c for c in [commands.in_process("bundle", "tracks.csv", "-o", "-")] if c.code == 0)
+    with np.load(io.BytesIO(track.out)) as file:
+        assert file["P"].shape == (5, 3, 4)
+
+
+def test_a_picture_goes_to_stdout() -> None:
+    pytest.importorskip("matplotlib", reason="pictures need Matplotlib")
+    done = commands.in_process("refine", "matches.csv", "--plot", "-")
+    assert done.check(0) == []
+    assert done.out.startswith(b"\x89PNG")
+    assert b"IEND" in done.out[-16:]
+
+
+@pytest.mark.parametrize(
+    "targets", [("-o", "-", "--json"), ("-o", "-", "--plot", "-"), ("-o", "-", "-o", "-")]
+)
+def test_stdout_holds_one_thing(targets: tuple[str, ...]) -> None:
+    done = commands.in_process("refine", "matches.csv", *targets)
+    assert done.check(2) == []
+    assert "one of them alone" in done.err
+
+
+def test_the_size_of_the_images_frames_the_picture() -> None:
+    pytest.importorskip("matplotlib", reason="pictures need Matplotlib")
+    words = "refine", "matches.csv", "--image-size"
+    assert commands.in_process(*words, "9", "0").check(2) == []
+    done = commands.in_process(*words, "512", "512", "--plot", "a.svg", "-o", "a.npz")
+    assert done.check(0) == []
+    assert commands.opened(Path("a.svg")) is None
