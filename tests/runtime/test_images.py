@@ -11,7 +11,7 @@ import epigauge as eg
 import numpy as np
 import pytest
 from epigauge.errors import ArgumentError, FileFormatError, MissingPackageError
-from epigauge.images import DETECTORS
+from epigauge.images import DETECTORS, matching
 from epigauge.images.loading import thumbnail
 from photographs import rendered
 from two_views import same_geometry
@@ -407,3 +407,17 @@ def test_what_reads_photographs_of_telephones_is_named(tmp_path, monkeypatch) ->
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     with pytest.raises(MissingPackageError, match=r"epigauge\[heic\]"):
         eg.load_image(path)
+
+
+@pytest.mark.parametrize("shape", [(700, 900), (3, 2), (513, 40)])
+def test_nearest_descriptors_are_those_of_opencv(shape) -> None:
+    """Of SIFT, whose descriptors are whole numbers, exactly."""
+    rng = np.random.default_rng(0)
+    drawn = [rng.gamma(0.5, 1.0, (n, 128)) for n in shape]
+    first, second = ((d * 512 / np.linalg.norm(d, axis=1)[:, None]).round() for d in drawn)
+    first[: min(shape) // 2] = second[: min(shape) // 2]
+    first, second = first.astype(np.float32), second.astype(np.float32)
+    index, clear = matching._nearest(cv2, first, second, 0.8)
+    distance, expected = cv2.batchDistance(first, second, cv2.CV_32F, normType=cv2.NORM_L2, K=2)
+    np.testing.assert_array_equal(index, expected[:, 0])
+    np.testing.assert_array_equal(clear, distance[:, 0] < 0.8 * distance[:, 1])

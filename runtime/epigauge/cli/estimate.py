@@ -78,7 +78,11 @@ def estimate(
     seconds = time.perf_counter() - begin
     kept = int(np.count_nonzero(result.inlier))
     rows = {"matches": f"{len(pair)}, {kept} inliers within {result.threshold_px:.3g} px"}
-    more: dict[str, Any] = {"source": str(matches), "matches": len(pair), "noise_estimated": noise_px is None}
+    more: dict[str, Any] = {
+        "source": str(matches),
+        "matches": len(pair),
+        "noise_estimated": noise_px is None,
+    }
     arrays = {"x1": pair.x1, "x2": pair.x2}
     more |= {"seconds": seconds} | arrays
     return finish(result, pair, result.used, more, rows, targets, json)

@@ -51,7 +51,7 @@ def pair(
             help="Longest side in pixels of the image that features are sought in; a larger one "
             "is made smaller for that. Results are in pixels of the full image."
         ),
-    ] = 2400,
+    ] = 2000,
     max_features: Annotated[int, typer.Option(help="Strongest features kept.")] = 8000,
     robust: Annotated[FrontEnd, choice(FrontEnd, "Robust start.")] = "auto",
     threshold_px: Annotated[
