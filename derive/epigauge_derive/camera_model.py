@@ -16,12 +16,15 @@ from functools import cache
 import sympy as sp
 
 from epigauge_derive.gauge import generator_kernels
-from epigauge_derive.kernel import Input, Kernel, Let, Output, at, cross, jacobian
+from epigauge_derive.kernel import Input, Kernel, Let, Loop, Output, at, cross, jacobian
 
 #: The camera frame; u and v stand for h0/h2 and h1/h2 where the image depends on these alone.
 H = Input("h", (3,))
 _U, _V, _INVERSE_DEPTH = sp.symbols("u v inverse_depth", real=True)
 MEASURED = Input("q", (2,))
+#: The measured point whose correction is an image: Newton steps lead to it from the image.
+_FOUND = sp.symbols("x_found y_found", real=True)
+_NEWTON = 8
 
 Vector = Sequence[sp.Expr]
 
@@ -151,6 +154,9 @@ class CameraModel:
         ``wrap(r, k)``: brings a residual to the nearest period, where the image has one.
     aliases : tuple of str
         Other names of the same model.
+    correct : callable
+        ``correct(q, k)``: what of a measured point q is compared with the image, for a lens that is
+        corrected on the side of the measurements; else q itself.
     """
 
     name: str
@@ -162,6 +168,7 @@ class CameraModel:
     constants: tuple[str, ...] = ()
     wrap: Callable[[Sequence[sp.Expr], Vector], Sequence[sp.Expr]] = lambda r, k: r
     aliases: tuple[str, ...] = ()
+    correct: Callable[[Vector, Vector], Sequence[sp.Expr]] = lambda q, k: q
 
     @property
     def prefix(self) -> str:
@@ -177,6 +184,11 @@ class CameraModel:
     def unknowns(self) -> dict[str, str]:
         """Return names and units of the update of a camera."""
         return {**self.frame.unknowns, **{name: self.parameters[name] for name in self.adjusted}}
+
+    @property
+    def corrects(self) -> bool:
+        """Tell whether measured points are corrected before they are compared."""
+        return self._corrected(MEASURED.entries()) != MEASURED.entries()
 
     @property
     def camera_size(self) -> int:
@@ -219,11 +231,12 @@ class CameraModel:
             self._sight(),
             self._retract(),
             self._image_alone(),
+            *([self._correction()] if self.corrects else []),
             *generator_kernels(self),
         ]
 
     def _project(self) -> Kernel:
-        _, image = self._image()
+        stages, image, _ = self._measured()
         return Kernel(
             f"{self.prefix}_project",
             f"image of a point by the camera {self.name}: {self.title}; depth > 0 is in front.",
@@ -232,13 +245,13 @@ class CameraModel:
                 Output.of("q_hat", sp.Matrix(image)),
                 Output.of("depth", self.depth(sp.Matrix(H.entries()))),
             ),
-            self._seen(),
+            (*self._seen(), *stages),
         )
 
     def _residual(self) -> Kernel:
         return Kernel(
             f"{self.prefix}_residual",
-            f"r = q - q_hat of a point in the camera {self.name}.",
+            f"{self._rest()} of a point in the camera {self.name}.",
             (*self.inputs(), MEASURED),
             (self._difference(),),
             self._seen(),
@@ -250,8 +263,9 @@ class CameraModel:
         turned = a * self.frame.velocities(sp.Matrix(H.entries()), self.point())
         return Kernel(
             f"{self.prefix}_observe",
-            f"r = q - q_hat of a point in the camera {self.name}, and the Jacobians of the image "
-            f"by the update of the camera ({', '.join(self.unknowns)}) and by the point.",
+            f"{self._rest()} of a point in the camera {self.name}, and the Jacobians of "
+            f"{self._seen_as()} by the update of the camera ({', '.join(self.unknowns)}) and by "
+            "the point.",
             (*self.inputs(), MEASURED),
             (
                 self._difference(),
@@ -265,23 +279,66 @@ class CameraModel:
         slopes, a, _ = self._slopes()
         return Kernel(
             f"{self.prefix}_sight",
-            f"r = q - q_hat of a point in the camera {self.name}, and the Jacobian of the image by "
-            "the point.",
+            f"{self._rest()} of a point in the camera {self.name}, and the Jacobian of "
+            f"{self._seen_as()} by the point.",
             (*self.inputs(), MEASURED),
             (self._difference(), Output.of("J_point", a * self.matrix()[:, : self.point_size])),
             (*self._seen(), slopes),
         )
 
     def _image_alone(self) -> Kernel:
-        through, image = self._image()
+        through, _ = self._image()
         slopes, a, _ = self._slopes()
+        stages, image, turn = self._measured()
         return Kernel(
             f"{self.prefix}_image",
             f"image of h in the frame of the camera {self.name}, and its derivative a.",
             (H, self.intrinsics()) if self.parameters else (H,),
-            (Output.of("q_hat", sp.Matrix(image)), Output.of("a", a)),
-            (through, slopes),
+            (Output.of("q_hat", sp.Matrix(image)), Output.of("a", turn * a)),
+            (through, *stages, slopes),
         )
+
+    def _correction(self) -> Kernel:
+        q = MEASURED.entries()
+        corrected = self._corrected(q)
+        return Kernel(
+            f"{self.prefix}_correct",
+            f"what the camera {self.name} compares with the image, c(q), and its derivative by q.",
+            (MEASURED, self.intrinsics()),
+            (
+                Output.of("corrected", sp.Matrix(corrected)),
+                Output.of("slope", jacobian(corrected, q)),
+            ),
+        )
+
+    def _corrected(self, q: Vector) -> list[sp.Expr]:
+        return [sp.sympify(e) for e in self.correct(q, self.intrinsics().entries())]
+
+    def _rest(self) -> str:
+        return "r = c(q) - q_hat, c the corrected point," if self.corrects else "r = q - q_hat"
+
+    def _seen_as(self) -> str:
+        return "-r" if self.corrects else "the image"
+
+    def _measured(self) -> tuple[tuple[Let | Loop, ...], list[sp.Expr], sp.Matrix]:
+        """Return the point that would be measured: stages, point, derivative by the image."""
+        image = self._image()[1]
+        if not self.corrects:
+            return (), image, sp.eye(2)
+        ideal, missed = (sp.symbols(f"{name}0:2", real=True) for name in ("ideal", "missed"))
+        corrected = self._corrected(_FOUND)
+        slope = sp.Matrix(2, 2, sp.symbols("slope0:2(0:2)", real=True))
+        turn = slope.adjugate() / slope.det()
+        named = dict(zip(slope, jacobian(corrected, _FOUND), strict=True))
+        misses = [c - p for c, p in zip(corrected, ideal, strict=True)]
+        steps = turn * sp.Matrix(missed)
+        newton = Loop(
+            start=dict(zip(_FOUND, ideal, strict=True)),
+            body={**named, **dict(zip(missed, misses, strict=True))},
+            update={x: x - step for x, step in zip(_FOUND, steps, strict=True)},
+            passes=_NEWTON,
+        )
+        return (Let(dict(zip(ideal, image, strict=True))), newton, Let(named)), list(_FOUND), turn
 
     def _seen(self) -> tuple[Let, ...]:
         """Return the stages that name the point in the camera frame."""
@@ -291,7 +348,8 @@ class CameraModel:
         )
 
     def _difference(self) -> Output:
-        r = [q - p for q, p in zip(MEASURED.entries(), self._image()[1], strict=True)]
+        measured = self._corrected(MEASURED.entries())
+        r = [q - p for q, p in zip(measured, self._image()[1], strict=True)]
         return Output.of("r", sp.Matrix(self.wrap(r, self.intrinsics().entries())))
 
     def _image(self) -> tuple[Let, list[sp.Expr]]:
@@ -305,7 +363,7 @@ class CameraModel:
         return Let(names), through
 
     def _slopes(self) -> tuple[Let, sp.Matrix, sp.Matrix]:
-        """Return the derivatives of the image by h and by the adjusted parameters, by name."""
+        """Return the derivatives of -r by h and by the adjusted parameters, by name."""
         intrinsics = dict(zip(self.parameters, self.intrinsics().entries(), strict=True))
         through, image = self._image()
         names: dict[sp.Symbol, sp.Expr] = {}
@@ -323,7 +381,8 @@ class CameraModel:
             a = named("a", named("b", jacobian(image, [_U, _V])) * direction)
         else:
             a = named("a", jacobian(image, H.entries()))
-        b = jacobian(image, [intrinsics[name] for name in self.adjusted])
+        adjusted = [intrinsics[name] for name in self.adjusted]
+        b = jacobian(image, adjusted) - jacobian(self._corrected(MEASURED.entries()), adjusted)
         return Let(names), a, b if b.cols else sp.zeros(2, 0)
 
     def _retract(self) -> Kernel:

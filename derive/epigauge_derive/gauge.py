@@ -100,8 +100,7 @@ def gauge(model: CameraModel) -> tuple[Field, ...]:
 
 
 def _evaluator(model: CameraModel) -> Callable[..., list[mpmath.matrix]]:
-    """Return a function of camera and point: J_camera and J_point with all digits."""
-    camera, X = model.inputs()
+    """Return a function of camera, point, measured point: J_camera, J_point with all digits."""
     observe = model.observe()
     matrices = [sp.Matrix(2, output.shape[1], output.entries) for output in observe.outputs[1:]]
     for stage in reversed(observe.stages):
@@ -111,7 +110,8 @@ def _evaluator(model: CameraModel) -> Callable[..., list[mpmath.matrix]]:
         matrices = [at(matrix, values) for matrix in matrices]
     functions = {"select": lambda condition, a, b: a if condition > 0 else b}
     modules = [functions, "mpmath"]
-    return sp.lambdify([camera.entries(), X.entries()], matrices, modules=modules, cse=True)
+    inputs = [argument.entries() for argument in observe.inputs]
+    return sp.lambdify(inputs, matrices, modules=modules, cse=True)
 
 
 def _place(model: CameraModel, rng: random.Random) -> list[mpmath.mpf]:
@@ -137,7 +137,8 @@ def _equations(
     rows: Rows = []
     for _ in range(20 * wanted):
         X = [mpmath.mpf(rng.uniform(-1, 1)) for _ in range(model.point_size)]
-        J_camera, J_point = (matrix.tolist() for matrix in evaluate(camera, X))
+        q = [mpmath.mpf(rng.uniform(-1, 1)) for _ in range(2)]
+        J_camera, J_point = (matrix.tolist() for matrix in evaluate(camera, X, q))
         vector = [*X, mpmath.mpf(1)][:4]
         pair = [
             [*own, *(slope * entry for slope in by_point for entry in vector)]

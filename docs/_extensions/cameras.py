@@ -40,7 +40,9 @@ class Cameras(SphinxDirective):
         )
         about += nodes.Text(numbers)
         section += about
-        section += formula(self, f"{model.prefix}_project")
+        # An image that is found by iterations is no formula; what it solves is one.
+        shown = "residual" if model.corrects else "project"
+        section += formula(self, f"{model.prefix}_{shown}")
         return section
 
 

@@ -7,6 +7,7 @@ const eg_camera_model eg_camera_models[] = {
     {"affine", 12, 8, 3, eg_affine_residual, eg_affine_observe, eg_affine_sight, eg_affine_retract},
     {"bal", 15, 9, 3, eg_bal_residual, eg_bal_observe, eg_bal_sight, eg_bal_retract},
     {"brown", 23, 16, 3, eg_brown_residual, eg_brown_observe, eg_brown_sight, eg_brown_retract},
+    {"brown_measured", 23, 16, 3, eg_brown_measured_residual, eg_brown_measured_observe, eg_brown_measured_sight, eg_brown_measured_retract},
     {"full_opencv", 24, 18, 3, eg_full_opencv_residual, eg_full_opencv_observe, eg_full_opencv_sight, eg_full_opencv_retract},
     {"opencv", 20, 14, 3, eg_opencv_residual, eg_opencv_observe, eg_opencv_sight, eg_opencv_retract},
     {"opencv_fisheye", 20, 14, 3, eg_opencv_fisheye_residual, eg_opencv_fisheye_observe, eg_opencv_fisheye_sight, eg_opencv_fisheye_retract},

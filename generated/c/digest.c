@@ -7,7 +7,7 @@
 
 const char *eg_digest(void)
 {
-    return "84b0f4b7ef332c78";
+    return "b311d2034cdb1553";
 }
 
 const char *eg_sources(void)

@@ -331,6 +331,67 @@ EG_EXPORT void eg_brown_point_generators(
     const double *EG_RESTRICT X,
     double *EG_RESTRICT N);
 
+EG_EXPORT void eg_brown_measured_project(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT depth);
+
+EG_EXPORT void eg_brown_measured_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_brown_measured_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_brown_measured_sight(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT q,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_point);
+
+EG_EXPORT void eg_brown_measured_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_brown_measured_image(
+    ptrdiff_t n,
+    const double *EG_RESTRICT h,
+    const double *EG_RESTRICT intrinsics,
+    double *EG_RESTRICT q_hat,
+    double *EG_RESTRICT a);
+
+EG_EXPORT void eg_brown_measured_correct(
+    ptrdiff_t n,
+    const double *EG_RESTRICT q,
+    const double *EG_RESTRICT intrinsics,
+    double *EG_RESTRICT corrected,
+    double *EG_RESTRICT slope);
+
+EG_EXPORT void eg_brown_measured_camera_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    double *EG_RESTRICT N);
+
+EG_EXPORT void eg_brown_measured_point_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    double *EG_RESTRICT N);
+
 EG_EXPORT void eg_full_opencv_project(
     ptrdiff_t n,
     const double *EG_RESTRICT camera,

@@ -25,8 +25,9 @@ class Model:
     """A camera model.
 
     Kernels are named ``<prefix>_project``, ``_residual``, ``_observe``, ``_retract``, ``_image``,
-    ``_camera_generators`` and ``_point_generators``. A camera is stored as its 3x4 matrix row by
-    row, then `params`. Those of `constants` are given once: no entry of an update belongs to them.
+    ``_camera_generators`` and ``_point_generators``; ``_correct`` where the model `corrects`
+    measured points before they are compared. A camera is stored as its 3x4 matrix row by row, then
+    `params`. Those of `constants` are given once: no entry of an update belongs to them.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Model:
     gauge_names: tuple[str, ...]
     metric: bool
     homogeneous: bool
+    corrects: bool
 
 
 SIGNATURES = {
@@ -304,6 +306,60 @@ SIGNATURES = {
         (Argument("X", (3,), True), ),
         (Argument("N", (3, 7), True), ),
         "velocities of a point of brown cameras by the gauge: rotation x, rotation y, rotation z, translation x, translation y, translation z, scale.",
+    ),
+    "brown_measured_project": Signature(
+        "cameras_brown_measured",
+        (Argument("camera", (23,), True), Argument("X", (3,), True), ),
+        (Argument("q_hat", (2,), True), Argument("depth", (), True), ),
+        "image of a point by the camera brown_measured: as brown, with the distortion a polynomial of the measured point, which it corrects; depth > 0 is in front.",
+    ),
+    "brown_measured_residual": Signature(
+        "cameras_brown_measured",
+        (Argument("camera", (23,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
+        (Argument("r", (2,), True), ),
+        "r = c(q) - q_hat, c the corrected point, of a point in the camera brown_measured.",
+    ),
+    "brown_measured_observe": Signature(
+        "cameras_brown_measured",
+        (Argument("camera", (23,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
+        (Argument("r", (2,), True), Argument("J_camera", (2, 16), True), Argument("J_point", (2, 3), True), ),
+        "r = c(q) - q_hat, c the corrected point, of a point in the camera brown_measured, and the Jacobians of -r by the update of the camera (wx, wy, wz, dx, dy, dz, c, x0, y0, A1, A2, A3, B1, B2, C1, C2) and by the point.",
+    ),
+    "brown_measured_sight": Signature(
+        "cameras_brown_measured",
+        (Argument("camera", (23,), True), Argument("X", (3,), True), Argument("q", (2,), True), ),
+        (Argument("r", (2,), True), Argument("J_point", (2, 3), True), ),
+        "r = c(q) - q_hat, c the corrected point, of a point in the camera brown_measured, and the Jacobian of -r by the point.",
+    ),
+    "brown_measured_retract": Signature(
+        "cameras_brown_measured",
+        (Argument("camera", (23,), True), Argument("delta", (16,), True), ),
+        (Argument("moved", (23,), True), ),
+        "brown_measured camera moved by an update (wx, wy, wz, dx, dy, dz, c, x0, y0, A1, A2, A3, B1, B2, C1, C2).",
+    ),
+    "brown_measured_image": Signature(
+        "cameras_brown_measured",
+        (Argument("h", (3,), True), Argument("intrinsics", (11,), True), ),
+        (Argument("q_hat", (2,), True), Argument("a", (2, 3), True), ),
+        "image of h in the frame of the camera brown_measured, and its derivative a.",
+    ),
+    "brown_measured_correct": Signature(
+        "cameras_brown_measured",
+        (Argument("q", (2,), True), Argument("intrinsics", (11,), True), ),
+        (Argument("corrected", (2,), True), Argument("slope", (2, 2), True), ),
+        "what the camera brown_measured compares with the image, c(q), and its derivative by q.",
+    ),
+    "brown_measured_camera_generators": Signature(
+        "cameras_brown_measured",
+        (Argument("camera", (23,), True), ),
+        (Argument("N", (16, 7), True), ),
+        "updates of a brown_measured camera by the gauge: rotation x, rotation y, rotation z, translation x, translation y, translation z, scale.",
+    ),
+    "brown_measured_point_generators": Signature(
+        "cameras_brown_measured",
+        (Argument("X", (3,), True), ),
+        (Argument("N", (3, 7), True), ),
+        "velocities of a point of brown_measured cameras by the gauge: rotation x, rotation y, rotation z, translation x, translation y, translation z, scale.",
     ),
     "full_opencv_project": Signature(
         "cameras_full_opencv",
@@ -1200,6 +1256,7 @@ MODELS = {
         gauge_names=('translation x', 'translation y', 'translation z', 'E00', 'E01', 'E02', 'E10', 'E11', 'E12', 'E20', 'E21', 'E22'),
         metric=False,
         homogeneous=False,
+        corrects=False,
     ),
     "bal": Model(
         name="bal",
@@ -1217,6 +1274,7 @@ MODELS = {
         gauge_names=('rotation x', 'rotation y', 'rotation z', 'translation x', 'translation y', 'translation z', 'scale'),
         metric=True,
         homogeneous=False,
+        corrects=False,
     ),
     "brown": Model(
         name="brown",
@@ -1234,6 +1292,25 @@ MODELS = {
         gauge_names=('rotation x', 'rotation y', 'rotation z', 'translation x', 'translation y', 'translation z', 'scale'),
         metric=True,
         homogeneous=False,
+        corrects=False,
+    ),
+    "brown_measured": Model(
+        name="brown_measured",
+        prefix='brown_measured',
+        title='as brown, with the distortion a polynomial of the measured point, which it corrects',
+        params=('c', 'x0', 'y0', 'A1', 'A2', 'A3', 'B1', 'B2', 'C1', 'C2', 'R0'),
+        units=('mm', 'mm', 'mm', '1/mm2', '1/mm4', '1/mm6', '1/mm', '1/mm', '1', '1', 'mm'),
+        constants=('R0',),
+        camera_size=23,
+        tangent_size=16,
+        point_size=3,
+        tangent_names=('wx', 'wy', 'wz', 'dx', 'dy', 'dz', 'c', 'x0', 'y0', 'A1', 'A2', 'A3', 'B1', 'B2', 'C1', 'C2'),
+        tangent_units=('rad', 'rad', 'rad', 'scene', 'scene', 'scene', 'mm', 'mm', 'mm', '1/mm2', '1/mm4', '1/mm6', '1/mm', '1/mm', '1', '1'),
+        gauge_dimension=7,
+        gauge_names=('rotation x', 'rotation y', 'rotation z', 'translation x', 'translation y', 'translation z', 'scale'),
+        metric=True,
+        homogeneous=False,
+        corrects=True,
     ),
     "FULL_OPENCV": Model(
         name="FULL_OPENCV",
@@ -1251,6 +1328,7 @@ MODELS = {
         gauge_names=('rotation x', 'rotation y', 'rotation z', 'translation x', 'translation y', 'translation z', 'scale'),
         metric=True,
         homogeneous=False,
+        corrects=False,
     ),
     "OPENCV": Model(
         name="OPENCV",
@@ -1268,6 +1346,7 @@ MODELS = {
         gauge_names=('rotation x', 'rotation y', 'rotation z', 'translation x', 'translation y', 'translation z', 'scale'),
         metric=True,
         homogeneous=False,
+        corrects=False,
     ),
     "OPENCV_FISHEYE": Model(
         name="OPENCV_FISHEYE",
@@ -1285,6 +1364,7 @@ MODELS = {
         gauge_names=('rotation x', 'rotation y', 'rotation z', 'translation x', 'translation y', 'translation z', 'scale'),
         metric=True,
         homogeneous=False,
+        corrects=False,
     ),
     "PINHOLE": Model(
         name="PINHOLE",
@@ -1302,6 +1382,7 @@ MODELS = {
         gauge_names=('rotation x', 'rotation y', 'rotation z', 'translation x', 'translation y', 'translation z', 'scale'),
         metric=True,
         homogeneous=False,
+        corrects=False,
     ),
     "pinhole": Model(
         name="pinhole",
@@ -1319,6 +1400,7 @@ MODELS = {
         gauge_names=('rotation x', 'rotation y', 'rotation z', 'translation x', 'translation y', 'translation z', 'scale'),
         metric=True,
         homogeneous=False,
+        corrects=False,
     ),
     "projective": Model(
         name="projective",
@@ -1336,6 +1418,7 @@ MODELS = {
         gauge_names=('translation x', 'translation y', 'translation z', 'E01', 'E02', 'E10', 'E11-E00', 'E12', 'E20', 'E21', 'E22-E00', 'E30', 'E31', 'E32', 'E33-E00'),
         metric=False,
         homogeneous=True,
+        corrects=False,
     ),
     "RADIAL": Model(
         name="RADIAL",
@@ -1353,6 +1436,7 @@ MODELS = {
         gauge_names=('rotation x', 'rotation y', 'rotation z', 'translation x', 'translation y', 'translation z', 'scale'),
         metric=True,
         homogeneous=False,
+        corrects=False,
     ),
     "SIMPLE_PINHOLE": Model(
         name="SIMPLE_PINHOLE",
@@ -1370,6 +1454,7 @@ MODELS = {
         gauge_names=('rotation x', 'rotation y', 'rotation z', 'translation x', 'translation y', 'translation z', 'scale'),
         metric=True,
         homogeneous=False,
+        corrects=False,
     ),
     "SIMPLE_RADIAL": Model(
         name="SIMPLE_RADIAL",
@@ -1387,6 +1472,7 @@ MODELS = {
         gauge_names=('rotation x', 'rotation y', 'rotation z', 'translation x', 'translation y', 'translation z', 'scale'),
         metric=True,
         homogeneous=False,
+        corrects=False,
     ),
     "spherical": Model(
         name="spherical",
@@ -1404,6 +1490,7 @@ MODELS = {
         gauge_names=('rotation x', 'rotation y', 'rotation z', 'translation x', 'translation y', 'translation z', 'scale'),
         metric=True,
         homogeneous=False,
+        corrects=False,
     ),
     "EQUIRECTANGULAR": Model(
         name="EQUIRECTANGULAR",
@@ -1421,5 +1508,6 @@ MODELS = {
         gauge_names=('rotation x', 'rotation y', 'rotation z', 'translation x', 'translation y', 'translation z', 'scale'),
         metric=True,
         homogeneous=False,
+        corrects=False,
     ),
 }

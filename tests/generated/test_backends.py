@@ -24,6 +24,8 @@ TRANSCENDENTAL = {
     "loss_cauchy",
     *(f"{model.prefix}_retract" for model in MODELS.values() if model.metric),
 }
+#: Camera models whose lens is corrected on the measured side.
+CORRECTED = tuple(f"{model.prefix}_" for model in MODELS.values() if model.corrects)
 SUMMED = {name for name, s in SIGNATURES.items() if not all(a.batched for a in s.outputs)}
 #: The kernels that take the matches of one F.
 MATCHED = [
@@ -102,6 +104,12 @@ def inputs(name, batch, seed, F=None):
         special["F"] = lambda: F
     elif name == "two_view_focals":  # the cases of F have axes in one plane: 0 / 0
         del special["F"]
+    if name.startswith(CORRECTED):  # Newton's steps to a measured point: of a lens that has one
+        special["intrinsics"] = lambda: 0.01 * rng.standard_normal((*shapes["intrinsics"], *batch))
+        size = shapes.get("camera", (0,))[0] - 12
+        special["camera"] = lambda: np.concatenate(
+            [rng.standard_normal((12, *batch)), 0.01 * rng.standard_normal((size, *batch))]
+        )
     arguments = []
     for argument in signature.inputs:
         shape = argument.shape + (batch if argument.batched else ())

@@ -70,18 +70,34 @@ def test_jacobians_are_differences_through_the_update(table, name, behind):
         q = np.array([0.3, -0.2])
         r, J_camera, J_point = call(model, "observe", camera, X, q, table=table)
 
-        def moved(delta, camera=camera, X=X, model=model):
+        def seen(delta, X, camera=camera, model=model, q=q):
             there = call(model, "retract", camera, delta, table=table)
-            return call(model, "project", there, X, table=table)[0]
+            return -call(model, "residual", there, X, q, table=table)
 
-        assert_jacobian(moved, np.zeros(model.tangent_size), J_camera)
-        assert_jacobian(
-            lambda X, camera=camera: call(model, "project", camera, X, table=table)[0], X, J_point
-        )
+        zero = np.zeros(model.tangent_size)
+        assert_jacobian(lambda delta, X=X, seen=seen: seen(delta, X), zero, J_camera)
+        assert_jacobian(lambda X, seen=seen: seen(zero, X), X, J_point)
         q_hat, _ = call(model, "project", camera, X, table=table)
         assert distance(r, call(model, "residual", camera, X, q, table=table)) <= 1e-15
-        if name != "spherical":
+        if model.corrects:
+            corrected, ideal = (call(model, "correct", p, camera[12:])[0] for p in (q, q_hat))
+            assert distance(r, corrected - ideal) <= 1e-14
+        elif name != "spherical":
             assert distance(r, q - q_hat) <= 1e-15
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if MODELS[name].corrects])
+def test_correction_has_its_derivative_and_is_undone_by_the_image(table, name):
+    model = MODELS[name]
+    rng = np.random.default_rng(8)
+    cameras, X = scene(model, rng, m=50)
+    k, q = cameras[12:, 0], np.array([0.3, -0.2])
+    corrected, slope = call(model, "correct", q, k, table=table)
+    assert distance(corrected, q) > 1e-3
+    assert_jacobian(lambda q: call(model, "correct", q, k, table=table)[0], q, slope)
+    q_hat, _ = call(model, "project", cameras, X, table=table)
+    r = call(model, "residual", cameras, X, q_hat, table=table)
+    assert distance(r, np.zeros_like(r)) <= 1e-14
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -100,10 +116,12 @@ def test_generators_are_the_null_space_of_many_views(name):
     model = MODELS[name]
     # Zero skew alone leaves the eight further freedoms of a projective frame to fewer than 8 views.
     n, m, d, b = 10, 30, model.tangent_size, model.point_size
-    cameras, X = scene(model, np.random.default_rng(5), n, m)
+    rng = np.random.default_rng(5)
+    cameras, X = scene(model, rng, n, m)
     J = np.zeros((n, m, 2, n * d + m * b))
     for i in range(n):
-        _, J_camera, J_point = call(model, "observe", cameras[:, i, None], X, np.zeros((2, m)))
+        q = rng.uniform(-0.5, 0.5, (2, m)) * model.corrects
+        _, J_camera, J_point = call(model, "observe", cameras[:, i, None], X, q)
         J[i, :, :, i * d : (i + 1) * d] = np.moveaxis(J_camera, 2, 0)
         for j in range(m):
             J[i, j, :, n * d + j * b : n * d + (j + 1) * b] = J_point[:, :, j]

@@ -23,12 +23,32 @@ def refined(model: str) -> tuple[str, ...]:
     return tuple(known.params[k] for k in known.focal)
 
 
+def corrected_residuals(scene: eg.MetricReconstruction, tracks: eg.Tracks) -> Array:
+    """Return what a photogrammetrist writes: q + correction(q) - (x0 - c k1/k3, y0 - c k2/k3)."""
+    k = scene.cameras.of_views[tracks.view].T
+    c, x0, y0, A1, A2, A3, B1, B2, C1, C2, R0 = k
+    h = np.einsum("nij,nj->ni", scene.R[tracks.view], scene.X[tracks.point]) + scene.t[tracks.view]
+    x, y = tracks.xy.T - [x0, y0]
+    r2 = x**2 + y**2
+    D = A1 * (r2 - R0**2) + A2 * (r2**2 - R0**4) + A3 * (r2**3 - R0**6)
+    dx = x * D + B1 * (r2 + 2 * x**2) + 2 * B2 * x * y + C1 * x + C2 * y
+    dy = y * D + B2 * (r2 + 2 * y**2) + 2 * B1 * x * y
+    return np.column_stack([x + dx + c * h[:, 0] / h[:, 2], y + dy + c * h[:, 1] / h[:, 2]])
+
+
+def compared(scene: eg.MetricReconstruction, tracks: eg.Tracks) -> Array:
+    """Return residuals (N, 2): of the measured points, or of the corrected ones."""
+    if scene.cameras.model == "brown_measured":
+        return corrected_residuals(scene, tracks)
+    return tracks.xy - scene.project(tracks)
+
+
 @pytest.mark.parametrize("model", METRIC)
 def test_every_model_agrees_with_dense_algebra(model: str) -> None:
     names = refined(model)
     tracks, scene = metric_scene(model, 3, n_points=14)
     dense = Dense(scene, names)
-    J = dense.jacobian(lambda s: s.project(tracks).ravel())
+    J = dense.jacobian(lambda s: compared(s, tracks).ravel())
     datum, C = conditions(dense, "all points")
     cov = eg.covariance(tracks, scene, datum, 0.7, refine=names or "pose")
     assert cov.open == 7
@@ -445,11 +465,23 @@ def test_points_far_away_do_not_spoil_a_datum_of_near_ones() -> None:
     assert (b.std.points[:25] >= 0.3 * a.std.points).all()
 
 
-def test_a_network_with_control_points_agrees_with_dense_algebra() -> None:
-    """As the report of a network: sigma0, redundancy, intrinsics, positions and points."""
+@pytest.mark.parametrize("model", ["brown", "brown_measured"])
+def test_a_network_with_control_points_agrees_with_dense_algebra(model: str) -> None:
+    """As the report of a network: sigma0, redundancy, intrinsics, positions and points.
+
+    With the distortion on the side of the image, and on the side of the measurements.
+    """
     tracks, scene = metric_scene(
-        "brown", 12, n_views=7, n_points=40, n_cameras=1, visible=0.8, noise_px=0.4
+        model, 12, n_views=7, n_points=40, n_cameras=1, visible=0.8, noise_px=0.4
     )
+    if model == "brown_measured":  # a lens that moves the corners by some pixels
+        k = scene.cameras.params.copy()
+        k[0, 3:] = 3e-8, -2e-14, 1e-20, 2e-6, -3e-6, 2e-4, -1e-4, 150.0
+        scene = eg.MetricReconstruction(
+            scene.R, scene.t, scene.X, eg.Cameras(model, k, scene.cameras.camera_of_view)
+        )
+        noise = np.random.default_rng(5).normal(0.0, 0.4, tracks.xy.shape)
+        tracks = eg.Tracks(tracks.view, tracks.point, scene.project(tracks) + noise)
     rng = np.random.default_rng(3)
     sigma = rng.choice([0.3, 0.5, 2.0], (len(tracks), 2))
     tracks = eg.Tracks(tracks.view, tracks.point, tracks.xy, sigma=sigma)
@@ -459,8 +491,8 @@ def test_a_network_with_control_points_agrees_with_dense_algebra() -> None:
     found = result.reconstruction
     np.testing.assert_array_equal(found.X[control], scene.X[control])
     dense = Dense(found, names)
-    J = dense.jacobian(lambda s: s.project(tracks).ravel()) / sigma.reshape(-1, 1)
-    r = (result.fun / sigma).ravel()
+    J = -dense.jacobian(lambda s: (compared(s, tracks) / sigma).ravel())
+    r = (compared(found, tracks) / sigma).ravel()
     held = np.zeros((dense.size, 3 * len(control)))
     for k, j in enumerate(control):
         held[dense.point(j), 3 * k : 3 * k + 3] = np.eye(3)
@@ -471,4 +503,21 @@ def test_a_network_with_control_points_agrees_with_dense_algebra() -> None:
     assert (cov.redundancy, cov.open) == (redundancy, 0)
     sigma0 = float(np.sqrt(r @ r / redundancy))
     assert cov.noise_px == pytest.approx(sigma0 * tracks.unit, rel=1e-9)
-    assert_same(cov, dense, sigma0**2 * dense.covariance(J.T @ J, held), 1e-5)
+    expected = sigma0**2 * dense.covariance(J.T @ J, held)
+    assert_same(cov, dense, expected, 1e-5)
+    assert result.cost == pytest.approx(0.5 * (r @ r) * tracks.unit**2, rel=1e-9)
+    # A point in a known view, in pixels as measured: by differences of `project`.
+    row = int(np.flatnonzero((tracks.view == 2) & ~np.isin(tracks.point, control))[0])
+    slope = dense.jacobian(lambda s: s.project(tracks)[row])
+    slope[:, dense.view(2)] = 0.0
+    ends = []  # a step of B1 as is small for one, where the image is no linear function of it
+    for step in (1e-9, -1e-9):
+        k = found.cameras.params + step * (np.array(camera_model(model).params) == "B1")
+        there = eg.Cameras(model, k, found.cameras.camera_of_view)
+        scene = eg.MetricReconstruction(found.R, found.t, found.X, there)
+        ends.append(scene.project(tracks)[row])
+    slope[:, dense.camera(0).start + 3] = (ends[0] - ends[1]) / 2e-9
+    xy, spread = cov.projection(int(tracks.point[row]), found.R[2], found.centres[2])
+    np.testing.assert_allclose(xy, found.project(tracks)[row], rtol=1e-12)
+    wanted = slope @ expected @ slope.T
+    np.testing.assert_allclose(spread, wanted, rtol=0.0, atol=1e-4 * np.abs(wanted).max())

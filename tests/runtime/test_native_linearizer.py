@@ -77,7 +77,7 @@ def scene(
     R = turned * np.linalg.det(turned)[:, None, None]
     R = R * np.sign(np.einsum("nii->ni", R))[:, :, None]
     R *= np.linalg.det(R)[:, None, None]
-    ahead = -6.0 if model.name in ("bal", "brown") else 6.0
+    ahead = -6.0 if model.name in ("bal", "brown", "brown_measured") else 6.0
     t = 0.3 * rng.standard_normal((n, 3)) + [0.0, 0.0, ahead]
     P, X = np.concatenate([R, t[:, :, None]], axis=2), rng.uniform(-1.0, 1.0, (m, 3))
     if not model.metric:

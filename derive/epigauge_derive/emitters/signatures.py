@@ -37,8 +37,9 @@ class Model:
     """A camera model.
 
     Kernels are named ``<prefix>_project``, ``_residual``, ``_observe``, ``_retract``, ``_image``,
-    ``_camera_generators`` and ``_point_generators``. A camera is stored as its 3x4 matrix row by
-    row, then `params`. Those of `constants` are given once: no entry of an update belongs to them.
+    ``_camera_generators`` and ``_point_generators``; ``_correct`` where the model `corrects`
+    measured points before they are compared. A camera is stored as its 3x4 matrix row by row, then
+    `params`. Those of `constants` are given once: no entry of an update belongs to them.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Model:
     gauge_names: tuple[str, ...]
     metric: bool
     homogeneous: bool
+    corrects: bool
 
 
 '''
@@ -112,6 +114,7 @@ def _model(model: CameraModel) -> str:
         "gauge_names": tuple(generators),
         "metric": bool(model.frame.relations),
         "homogeneous": model.frame.point_size == 4,
+        "corrects": model.corrects,
     }
     text = ""
     for name in (model.name, *model.aliases):

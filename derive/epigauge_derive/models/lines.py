@@ -121,7 +121,7 @@ def _calibration(model: CameraModel) -> sp.Matrix:
 
 def straight(model: CameraModel) -> bool:
     """Tell whether a camera maps lines to lines: a pose, and an image that is linear in h0, h1."""
-    if model.frame is not POSE:
+    if model.frame is not POSE or model.corrects:
         return False
     h = H.entries()
     image = model.image(sp.Matrix([h[0], h[1], 1]), model.intrinsics().entries())

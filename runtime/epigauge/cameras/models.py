@@ -47,6 +47,8 @@ class CameraModel:
         Whether a camera has a rotation and a position.
     homogeneous : bool
         Whether points are homogeneous: they and the cameras have scales that change no image.
+    corrects : bool
+        Whether the lens is corrected on the measured side: residuals are those of corrected points.
     """
 
     name: str
@@ -62,6 +64,7 @@ class CameraModel:
     gauge_dimension: int
     metric: bool
     homogeneous: bool
+    corrects: bool
 
     @property
     def adjusted(self) -> tuple[str, ...]:

@@ -248,9 +248,13 @@ class GaugeFree:
         pose = np.column_stack([R, -R @ centre])
         vector = np.concatenate([pose.ravel(), scene.cameras.params[camera]])
         with np.errstate(all="ignore"):
-            r, J, J_point = known.kernel("observe")(vector, scene.X[point], np.zeros(2))
+            xy, _ = known.kernel("project")(vector, scene.X[point])
+            _, J, J_point = known.kernel("observe")(vector, scene.X[point], xy)
+        if known.corrects:  # J is that of the corrected point
+            slope = known.kernel("correct")(xy, scene.cameras.params[camera])[1]
+            J, J_point = np.linalg.solve(slope, J), np.linalg.solve(slope, J_point)
         # x_cam = exp(w) (R X + t - move): the view turns by -R^T w, its centre moves by R^T move.
-        return -r, np.hstack([-J[:, :3] @ R, J[:, 3:_POSE] @ R, J[:, _POSE:], J_point])
+        return xy, np.hstack([-J[:, :3] @ R, J[:, 3:_POSE] @ R, J[:, _POSE:], J_point])
 
     def _length(self, i: int, j: int) -> tuple[float, Array]:
         """Return the distance of two points, and its derivatives (6,)."""
