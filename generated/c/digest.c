@@ -7,7 +7,7 @@
 
 const char *eg_digest(void)
 {
-    return "b311d2034cdb1553";
+    return "2b5e0b53e58875af";
 }
 
 const char *eg_sources(void)

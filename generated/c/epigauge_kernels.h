@@ -1530,6 +1530,29 @@ EG_EXPORT void eg_rotation_derivatives(
     double *EG_RESTRICT dU,
     double *EG_RESTRICT d2U);
 
+EG_EXPORT void eg_agreement(
+    ptrdiff_t n,
+    const double *EG_RESTRICT F,
+    const double *EG_RESTRICT scale2_array,
+    const double *EG_RESTRICT floor2_array,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    double *EG_RESTRICT factor);
+
+EG_EXPORT void eg_sampson_side(
+    ptrdiff_t n,
+    const double *EG_RESTRICT F,
+    const double *EG_RESTRICT e2,
+    const double *EG_RESTRICT q1,
+    const double *EG_RESTRICT q2,
+    double *EG_RESTRICT squared,
+    double *EG_RESTRICT side);
+
+EG_EXPORT void eg_epipole(
+    ptrdiff_t n,
+    const double *EG_RESTRICT F,
+    double *EG_RESTRICT epipole);
+
 EG_EXPORT void eg_dual_image_rows(
     ptrdiff_t n,
     const double *EG_RESTRICT P,

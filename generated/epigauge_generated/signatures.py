@@ -1219,6 +1219,24 @@ SIGNATURES = {
         (Argument("dU", (3, 3, 3), True), Argument("d2U", (3, 3, 3, 3), True), ),
         "first and second derivatives of U R(theta) at theta = 0 (from B&S eqs. 1, 3).",
     ),
+    "agreement": Signature(
+        "search",
+        (Argument("F", (3, 3), False), Argument("scale2", (), False), Argument("floor2", (), False), Argument("q1", (2,), True), Argument("q2", (2,), True), ),
+        (Argument("factor", (), True), ),
+        "1 + scale^2 / (d^2 + floor^2) with Sampson's distance d of a match: the product over the matches is what a search judges F by.",
+    ),
+    "sampson_side": Signature(
+        "search",
+        (Argument("F", (3, 3), False), Argument("e2", (3,), False), Argument("q1", (2,), True), Argument("q2", (2,), True), ),
+        (Argument("squared", (), True), Argument("side", (), True), ),
+        "squared Sampson distance of a match, and (e' x q') . (F q), of one sign for all points in front of both cameras (oriented epipolar constraint, Chum, Werner, Matas 2004).",
+    ),
+    "epipole": Signature(
+        "search",
+        (Argument("F", (3, 3), True), ),
+        (Argument("epipole", (3,), True), ),
+        "e' with e'^T F = 0, of any length: the longest product of two columns of F.",
+    ),
     "dual_image_rows": Signature(
         "self_calibration",
         (Argument("P", (3, 4), True), ),

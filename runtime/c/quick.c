@@ -15,7 +15,7 @@ enum { PAIR_FRAME = 31, PAIR_MOTION = 36, PAIR_CONDITIONED = 55, PAIR_NORMAL = 6
 
 /* Numbers of a pair, as `quick.Facts` has them. */
 enum { COUNT = 0, SQUARES, EXTENT, LEAST, UNORIENTED, MEDIAN, TAIL, FOURTH, AFFINE, ON_PLANE,
-       PLANE, CHANCE, NEAR, REPEATED, FACTS };
+       PLANE, CHANCE, NEAR, REPEATED, PLACES, FACTS };
 
 typedef struct {
     ptrdiff_t n;
@@ -215,9 +215,32 @@ static void refit(const pool_t *p, double bound, double *v)
     }
 }
 
-/* The share of the matches that the best of some planes through three of them explains. */
+/* In how many places those are that are off a plane: side by side in both images they are one. */
+static double places_off(const scratch_t *s, const pool_t *p, const double *v, double bound,
+                         double beside)
+{
+    double *cells = s->room;
+    ptrdiff_t found = 0;
+    for (ptrdiff_t i = 0; i < p->n; i += p->step) {
+        const double off = p->gain[i] * (p->kappa[i] - v[0] * p->x[i] - v[1] * p->y[i] - v[2]);
+        double *own = cells + 4 * found;
+        ptrdiff_t k = 0;
+        if (!(fabs(off) > bound))
+            continue;
+        for (int c = 0; c < 4; ++c)
+            own[c] = nearbyint(s->q[c * s->n + i] / beside);
+        while (k < found && (cells[4 * k] != own[0] || cells[4 * k + 1] != own[1] ||
+                             cells[4 * k + 2] != own[2] || cells[4 * k + 3] != own[3]))
+            ++k;
+        found += k == found;
+    }
+    return (double)found;
+}
+
+/* The share of the matches that the best of some planes through three of them explains, and in how
+   many places the others are. */
 static double on_plane(scratch_t *s, const double *motion, const double *F, double noise,
-                       const eg_quick_options *options)
+                       const eg_quick_options *options, double *places)
 {
     const double e2[3] = {motion[2], motion[5], motion[8]};
     const double unit = sqrt(2.0) * noise; /* of a parallax, whose length both images share */
@@ -250,6 +273,7 @@ static double on_plane(scratch_t *s, const double *motion, const double *F, doub
     }
     refit(&p, options->reach * unit, best);
     refit(&p, options->far * unit, best);
+    *places = places_off(s, &p, best, options->far * unit, options->beside);
     return count_on(&p, best, options->far * unit) / (double)size;
 }
 
@@ -293,32 +317,65 @@ static double plane(scratch_t *s)
     return sum;
 }
 
-/* The probability that a wrong match is within a distance of F, from pairs of the points. */
-static double chance(scratch_t *s, const double *F, double limit, const eg_quick_options *options)
+double eg_chance(ptrdiff_t n, const double *F, const double *q, double limit, ptrdiff_t pairs,
+                 ptrdiff_t rank, double *room)
 {
-    const ptrdiff_t n = s->n;
-    ptrdiff_t rounds = (options->pairs + n - 1) / n, total = 0, near = 0;
+    ptrdiff_t rounds = (pairs + n - 1) / n, total = 0, near = 0;
     rounds = rounds > n - 1 ? n - 1 : rounds;
-    double *other = s->room, *d = other + 2 * n, *unused = d + n;
-    double *all = unused + 9 * n;
+    double e2[3], *other = room, *side = other + 2 * n, *all = side + n;
+    eg_epipole(1, F, e2);
     for (ptrdiff_t k = 0; k < rounds; ++k) {
         const ptrdiff_t shift = rounds > 1 ? 1 + k * (n - 2) / (rounds - 1) : 1;
         for (int c = 0; c < 2; ++c) {
-            const double *x = s->q + (2 + c) * n;
+            const double *x = q + (2 + c) * n;
             memcpy(other + c * n, x + n - shift, (size_t)shift * sizeof(double));
             memcpy(other + c * n + shift, x, (size_t)(n - shift) * sizeof(double));
         }
-        eg_sampson(n, F, s->q, other, d, unused);
-        for (ptrdiff_t i = 0; i < n; ++i) {
-            near += fabs(d[i]) <= limit;
-            all[total++] = fabs(d[i]);
-        }
+        eg_sampson_side(n, F, e2, q, other, all + total, side);
+        total += n;
     }
-    if (near >= options->rank || near == total)
+    for (ptrdiff_t i = 0; i < total; ++i)
+        near += all[i] <= limit * limit;
+    if (near >= rank || near == total)
         return (double)near / (double)total;
-    const ptrdiff_t rank = (options->rank < total ? options->rank : total) - 1;
-    const double further = kth(all, total, rank);
+    rank = (rank < total ? rank : total) - 1;
+    const double further = sqrt(kth(all, total, rank));
     return further > 0.0 ? (double)(rank + 1) / (double)total * fmin(limit / further, 1.0) : 1.0;
+}
+
+/* The same of matches q1, q2 (2, n); negative where memory ran out. */
+EG_EXPORT double eg_chance_agreement(ptrdiff_t n, const double *F, const double *q1,
+                                     const double *q2, double limit, ptrdiff_t pairs,
+                                     ptrdiff_t rank)
+{
+    double *room = malloc((size_t)(8 * n + pairs + 1) * sizeof *room);
+    if (!room)
+        return -1.0;
+    memcpy(room, q1, (size_t)(2 * n) * sizeof *room);
+    memcpy(room + 2 * n, q2, (size_t)(2 * n) * sizeof *room);
+    const double found = eg_chance(n, F, room, limit, pairs, rank, room + 4 * n);
+    free(room);
+    return found;
+}
+
+/* How many points of an image repeat those of earlier matches, in the image with more of them; -1
+   where memory ran out. */
+static ptrdiff_t repeated(const scratch_t *s, ptrdiff_t *rows)
+{
+    const ptrdiff_t ends[2] = {0, s->n};
+    ptrdiff_t most = 0;
+    for (int image = 0; image < 2; ++image) {
+        const double *x = s->q + 2 * image * s->n, *y = x + s->n;
+        for (ptrdiff_t i = 0; i < s->n; ++i) {
+            s->room[2 * i] = x[i];
+            s->room[2 * i + 1] = y[i];
+        }
+        const ptrdiff_t own = eg_copies(1, ends, s->room, s->room, rows);
+        if (own < 0)
+            return -1;
+        most = own > most ? own : most;
+    }
+    return most;
 }
 
 static void judge(scratch_t *s, const double *result, const eg_quick_options *options,
@@ -349,17 +406,18 @@ static void judge(scratch_t *s, const double *result, const eg_quick_options *op
     facts[LEAST] = least_determined(motion, result + PAIR_NORMAL);
     facts[UNORIENTED] = unoriented(s, motion, F, options->within * noise);
     facts[AFFINE] = affine(s);
-    facts[CHANCE] = facts[ON_PLANE] = facts[NEAR] = facts[REPEATED] = 0.0;
+    facts[CHANCE] = facts[ON_PLANE] = facts[NEAR] = facts[REPEATED] = facts[PLACES] = 0.0;
     facts[PLANE] = INFINITY;
     if (noise > options->wide) {
         for (ptrdiff_t i = 0; i < n; ++i)
             facts[NEAR] += fabs(s->d[i]) <= options->within * noise;
-        facts[CHANCE] = chance(s, F, options->within * noise, options);
+        facts[CHANCE] = eg_chance(n, F, s->q, options->within * noise, options->pairs, options->rank,
+                                  s->room);
     }
     if (noise > options->hidden)
         facts[PLANE] = plane(s);
     else
-        facts[ON_PLANE] = on_plane(s, motion, F, noise, options);
+        facts[ON_PLANE] = on_plane(s, motion, F, noise, options, facts + PLACES);
 }
 
 /* facts (n, FACTS) of refined pairs: x1, x2, weights and distances as for eg_refine_pairs, with its
@@ -369,6 +427,7 @@ EG_EXPORT int eg_quick_facts(ptrdiff_t pairs, const ptrdiff_t *offsets, const do
                              ptrdiff_t stride, const double *distances, const double *results,
                              const eg_quick_options *options, double *facts)
 {
+    int done = 1;
     ptrdiff_t most = 0;
     for (ptrdiff_t k = 0; k < pairs; ++k)
         most = offsets[k + 1] - offsets[k] > most ? offsets[k + 1] - offsets[k] : most;
@@ -390,14 +449,11 @@ EG_EXPORT int eg_quick_facts(ptrdiff_t pairs, const ptrdiff_t *offsets, const do
         gather(&s, offsets[k + 1] - begin, x1 + 2 * begin, x2 + 2 * begin,
                weights ? weights + begin : NULL, distances + begin, result + PAIR_FRAME);
         judge(&s, result, options, facts + FACTS * k);
-        if (facts[FACTS * k + NEAR] > 0.0) {
-            const ptrdiff_t ends[2] = {0, offsets[k + 1] - begin};
-            const ptrdiff_t first = eg_copies(1, ends, x1 + 2 * begin, x1 + 2 * begin, rows);
-            const ptrdiff_t second = eg_copies(1, ends, x2 + 2 * begin, x2 + 2 * begin, rows);
-            facts[FACTS * k + REPEATED] = (double)(first > second ? first : second);
-        }
+        if (options->searched || facts[FACTS * k + NEAR] > 0.0)
+            facts[FACTS * k + REPEATED] = (double)repeated(&s, rows);
+        done &= !(facts[FACTS * k + REPEATED] < 0.0);
     }
     free(memory);
     free(rows);
-    return 1;
+    return done;
 }

@@ -52,62 +52,20 @@ static ptrdiff_t draw(search_t *s, ptrdiff_t n)
     return (ptrdiff_t)((double)(z >> 11) * 0x1p-53 * (double)n);
 }
 
-static void epipole(const double *F, double *e2)
-{
-    double longest = 0.0;
-    for (int k = 0; k < 3; ++k) {
-        const int a = k, b = (k + 1) % 3;
-        const double x = F[3 + a] * F[6 + b] - F[6 + a] * F[3 + b];
-        const double y = F[6 + a] * F[b] - F[a] * F[6 + b];
-        const double z = F[a] * F[3 + b] - F[3 + a] * F[b];
-        const double length = x * x + y * y + z * z;
-        if (length > longest) {
-            longest = length;
-            e2[0] = x, e2[1] = y, e2[2] = z;
-        }
-    }
-}
-
-/* A match in the line F q1 = (a, b, c): C = q2^T F q1, length2 the square of its gradient. The
-   kernel `sampson` also writes derivatives, which a search has no use for. */
-typedef struct {
-    double a, b, c, C, length2;
-} sampson_t;
-
-static inline sampson_t sampson(const double *F, double x1, double y1, double x2, double y2)
-{
-    const double a = F[0] * x1 + F[1] * y1 + F[2];
-    const double b = F[3] * x1 + F[4] * y1 + F[5];
-    const double c = F[6] * x1 + F[7] * y1 + F[8];
-    const double d = F[0] * x2 + F[3] * y2 + F[6];
-    const double e = F[1] * x2 + F[4] * y2 + F[7];
-    const sampson_t at = {a, b, c, a * x2 + b * y2 + c, a * a + b * b + d * d + e * e};
-    return at;
-}
-
-/* (e' x q') . (F q) */
-static inline double side_of(const sampson_t *at, const double *e2, double x2, double y2)
-{
-    return (e2[1] - e2[2] * y2) * at->a + (e2[2] * x2 - e2[0]) * at->b +
-           (e2[0] * y2 - e2[1] * x2) * at->c;
-}
-
-/* Sum of log(1 + scale^2 / (d^2 + floor^2)) over the matches q (4, m). */
+/* Sum of log(1 + scale^2 / (d^2 + floor^2)) over the matches q (4, m); factors is room for m. */
 static double agreement(double scale2, double floor2, ptrdiff_t m, const double *q,
-                        const double *F)
+                        const double *F, double *factors)
 {
-    const double *x1 = q, *y1 = x1 + m, *x2 = y1 + m, *y2 = x2 + m;
     double sum = 0.0;
+    eg_agreement(m, F, &scale2, &floor2, q, q + 2 * m, factors);
     for (ptrdiff_t begin = 0; begin < m; begin += CHUNK) {
         const ptrdiff_t end = m - begin < CHUNK ? m : begin + CHUNK;
         double product = 1.0;
 #ifndef _MSC_VER
 #pragma omp simd reduction(* : product)
 #endif
-        for (ptrdiff_t i = begin; i < end; ++i) {
-            const sampson_t at = sampson(F, x1[i], y1[i], x2[i], y2[i]);
-            product *= 1.0 + scale2 * at.length2 / (at.C * at.C + floor2 * at.length2 + 1e-300);
-        }
+        for (ptrdiff_t i = begin; i < end; ++i)
+            product *= factors[i];
         sum += log1p(product - 1.0);
     }
     return sum;
@@ -119,24 +77,20 @@ static double score(const search_t *s, const double *F)
     const double wide2 = BLUNT * BLUNT * s->noise2;
     const double luck2 = fmax(LUCK * LUCK * s->noise2, s->floor2);
     if (!(s->noise2 > 0.0))
-        return agreement(s->scale2, s->floor2, s->m, s->q, F);
-    return agreement(s->scale2, luck2, s->off, s->split, F) +
-           agreement(wide2, wide2, s->m - s->off, s->split + 4 * s->off, F);
+        return agreement(s->scale2, s->floor2, s->m, s->q, F, s->work);
+    return agreement(s->scale2, luck2, s->off, s->split, F, s->work) +
+           agreement(wide2, wide2, s->m - s->off, s->split + 4 * s->off, F, s->work);
 }
 
 /* Squared distances to first order; infinity for matches on the wrong side of an epipole. */
 static void distances(const search_t *s, const double *F, double *squared)
 {
-    const double *x1 = s->q1, *y1 = x1 + s->m, *x2 = s->q2, *y2 = x2 + s->m;
-    double e2[3] = {0.0}, votes = 0.0, *side = s->work + s->m;
-    epipole(F, e2);
+    double e2[3], votes = 0.0, *side = s->work + s->m;
+    eg_epipole(1, F, e2);
+    eg_sampson_side(s->m, F, e2, s->q1, s->q2, squared, side);
     EG_SUM(votes)
-    for (ptrdiff_t i = 0; i < s->m; ++i) {
-        const sampson_t at = sampson(F, x1[i], y1[i], x2[i], y2[i]);
-        squared[i] = at.C * at.C / (at.length2 + 1e-300);
-        side[i] = side_of(&at, e2, x2[i], y2[i]);
+    for (ptrdiff_t i = 0; i < s->m; ++i)
         votes += side[i] > 0.0 ? 1.0 : -1.0;
-    }
     for (ptrdiff_t i = 0; i < s->m; ++i)
         if (!((side[i] > 0.0) == (votes >= 0.0)))
             squared[i] = INFINITY;
@@ -235,7 +189,8 @@ static int improved(search_t *s, ptrdiff_t n, ptrdiff_t finalists, const double 
     double first[3 * BATCH];
     const double *best = NULL;
     for (ptrdiff_t k = 0; k < n; ++k)
-        first[k] = agreement(s->scale2, s->floor2, s->judges, s->some, proposals + 9 * k);
+        first[k] = agreement(s->scale2, s->floor2, s->judges, s->some, proposals + 9 * k,
+                             s->work);
     for (ptrdiff_t trial = 0; trial < finalists && trial < n; ++trial) {
         ptrdiff_t next = 0;
         for (ptrdiff_t k = 1; k < n; ++k)
@@ -332,7 +287,7 @@ static ptrdiff_t plane(search_t *s, double *H)
     ptrdiff_t most = 0;
     if (n < 7)
         return 0;
-    epipole(s->F, e2);
+    eg_epipole(1, s->F, e2);
     for (int k = 0; k < 3; ++k)
         norm += e2[k] * e2[k];
     for (int k = 0; k < 3; ++k)
@@ -454,32 +409,6 @@ static void plane_and_parallax(search_t *s)
     free(rows);
     s->noise2 = 0.0;
     s->score = score(s, s->F);
-}
-
-/* Exact distances (m) of conditioned matches q1, q2 (2, m), and the sides (m) of the epipoles: all
-   of points in front of both cameras have one sign. */
-EG_EXPORT void eg_measure(ptrdiff_t m, const double *F, const double *q1, const double *q2,
-                          double *distances, double *side)
-{
-    const eg_options options = {.criterion = EG_REPROJECTION, .loss = EG_LINEAR};
-    double q[4 * EG_BLOCK], weights[EG_BLOCK], multiplier[EG_BLOCK], e2[3] = {0.0};
-    epipole(F, e2);
-    for (int i = 0; i < EG_BLOCK; ++i)
-        weights[i] = 1.0;
-    for (ptrdiff_t begin = 0; begin < m; begin += EG_BLOCK) {
-        const ptrdiff_t n = m - begin < EG_BLOCK ? m - begin : EG_BLOCK;
-        const double *x1 = q1 + begin, *y1 = x1 + m, *x2 = q2 + begin, *y2 = x2 + m;
-        eg_matches block = {n, q, weights, multiplier, distances + begin};
-        memcpy(q, x1, (size_t)n * sizeof(double));
-        memcpy(q + n, y1, (size_t)n * sizeof(double));
-        memcpy(q + 2 * n, x2, (size_t)n * sizeof(double));
-        memcpy(q + 3 * n, y2, (size_t)n * sizeof(double));
-        eg_distances(&block, &options, F);
-        for (ptrdiff_t i = 0; i < n; ++i) {
-            const sampson_t at = sampson(F, x1[i], y1[i], x2[i], y2[i]);
-            side[begin + i] = side_of(&at, e2, x2[i], y2[i]);
-        }
-    }
 }
 
 /* Share of the matches near one in either image that are near it in both: right matches have

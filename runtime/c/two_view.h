@@ -96,6 +96,8 @@ typedef struct {
     double reach, far;       /* standard deviations off a plane through three matches, or more */
     ptrdiff_t samples, pool; /* threes of matches, and how many they are judged by */
     ptrdiff_t pairs, rank;   /* wrong pairs, and how many must be near */
+    double beside;           /* what is in one place */
+    ptrdiff_t searched;      /* whether F itself chose these among raw matches */
 } eg_quick_options;
 
 /* The median of some values, which are reordered. */
@@ -110,5 +112,19 @@ typedef struct {
     double scale, floor2;          /* of distances, and a part of its square that is rounding */
     double patience, width[4];     /* more samples than one is good; widths in scales */
 } eg_search_options;
+
+/* The mixture of right and wrong matches, as in the structure of native.py. */
+typedef struct {
+    double extent, range;         /* distances that count, all where it is the range of them */
+    double widest, floor;         /* of the deviation */
+    double least, most;           /* of the share */
+    double climbed, ftol;         /* gain of the likelihood, and of the cost of a fit, that ends */
+    int climbs, steps;            /* at most, and of a fit */
+} eg_mixture_options;
+
+/* The probability that a wrong match is within a distance of F, from so many pairs of the points of
+   matches q (4, n) of which so many must be near; room has 4 n + pairs doubles. */
+double eg_chance(ptrdiff_t n, const double *F, const double *q, double limit, ptrdiff_t pairs,
+                 ptrdiff_t rank, double *room);
 
 #endif

@@ -74,3 +74,54 @@ def test_points_that_many_are_matched_to_count_once() -> None:
     assert quickly(x1, x2)[0] is not None
     x2[10:] = x2[10]  # every line through this point agrees
     assert quickly(x1, x2)[0] is None
+
+
+def raw_kinds() -> list[tuple[str, Array, Array]]:
+    """Raw matches of all kinds, a third of them wrong."""
+    rng, found = np.random.default_rng(7), []
+    for m, noise in ((40, 0.5), (150, 0.4), (600, 0.8)):
+        for kind in ("general", "planar", "rotation", "random"):
+            x1, x2 = scene("general" if kind == "random" else kind, m, noise, rng)
+            share = 1.0 if kind == "random" else 0.3
+            bad = rng.random(m) < share
+            x2 = x2.copy()
+            x2[bad] = rng.uniform([0.0, 0.0], [1024.0, 768.0], (np.count_nonzero(bad), 2))
+            found.append((kind, x1, x2))
+    view = eg.two_view_scene(16.0, n_points=300, seed=5)
+    found.append(("weak", view.x1, view.x2))
+    x1, x2 = scene("general", 300, 0.4, rng)
+    x2 = x2.copy()
+    x2[:60] = x2[0]  # one point that many are matched to
+    found.append(("many to one", x1, x2))
+    return found
+
+
+@needs_c
+@pytest.mark.parametrize("case", raw_kinds(), ids=lambda case: f"{case[0]}-{len(case[1])}")
+def test_raw_matches_are_told_by_cheap_tests_what_the_diagnosis_says(case, monkeypatch) -> None:
+    kind, x1, x2 = case
+    told = []
+    whole = quick.verdict_of_raw
+
+    def asked(*arguments):
+        told.append(whole(*arguments))
+        return told[-1]
+
+    monkeypatch.setattr(quick, "verdict_of_raw", asked)
+    found = eg.estimate_fundamental(x1, x2)
+    own = found.flags, found.success
+    monkeypatch.setattr(quick, "verdict_of_raw", lambda *_: (None, False))
+    thorough = eg.estimate_fundamental(x1, x2)
+    assert own == (thorough.flags, thorough.success)
+    assert len(told) == 1
+    plainly = kind in ("general", "many to one") and len(x1) > 100
+    assert (told[0][0] is not None) == plainly
+
+
+@needs_c
+def test_weights_of_raw_matches_reach_the_cheap_tests() -> None:
+    x1, x2 = scene("general", 300, 0.5, np.random.default_rng(3))
+    w = np.ones(300)
+    w[::3] = 0.0
+    flags = eg.estimate_fundamental(x1, x2, weights=w).flags
+    assert flags == eg.estimate_fundamental(x1, x2, weights=w, backend="numpy").flags == ()

@@ -159,3 +159,20 @@ def test_seven_points_are_the_solutions_of_the_public_function():
     residuals = [np.abs(algebraic(G / np.linalg.norm(G), scene.x1, scene.x2)).max() for G in F]
     assert min(residuals) < 1e-6
     assert 7.0 in np.abs(votes)  # the true one has all points in front of both cameras
+
+
+@pytest.mark.parametrize("name", ["c", "numpy", "casadi"])
+def test_kernels_of_the_search_are_those_with_derivatives(name) -> None:
+    if kernels.available()[name] is not None:
+        pytest.skip(f"needs {name}")
+    table, rng = kernels.table(name), np.random.default_rng(5)
+    U, V = (np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(2))
+    F, (q1, q2) = U @ np.diag([1.0, 0.4, 0.0]) @ V.T, rng.standard_normal((2, 2, 30))
+    e2 = table.epipole(F)
+    np.testing.assert_allclose(F.T @ e2, 0.0, atol=1e-15)
+    squared, side = table.sampson_side(F, e2, q1, q2)
+    np.testing.assert_allclose(squared, table.sampson(F, q1, q2)[0][0] ** 2, rtol=1e-12)
+    h1, h2 = (np.vstack([q, np.ones(30)]) for q in (q1, q2))
+    np.testing.assert_allclose(side, np.sum(np.cross(e2, h2, axisb=0, axisc=0) * (F @ h1), axis=0))
+    factor = table.agreement(F, 0.04, 0.01, q1, q2)
+    np.testing.assert_allclose(factor, 1.0 + 0.04 / (squared + 0.01), rtol=1e-12)

@@ -18,11 +18,15 @@ References
 
 from __future__ import annotations
 
+import ctypes
 import math
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge._library import address, library
 from epigauge.kernels import Table
 from epigauge.two_view.homography import plane_squares
 
@@ -106,14 +110,27 @@ def chance_agreement(table: Table, F: Array, q1: Array, q2: Array, limit: float)
     float
         Where few wrong pairs are so near, from the density of the distance further out.
     """
+    if table.compiled:
+        F = np.ascontiguousarray(F)
+        m = q1.shape[1]
+        chance = float(_function()(m, *map(address, (F, q1, q2)), limit, PAIRS, RANK))
+        if chance < 0.0:
+            raise MemoryError(f"no room for {m} matches")
+        return chance
+    e2 = table.epipole(F)
+    rolled = (np.roll(q2, shift, axis=1) for shift in _shifts(q1.shape[1]))
     with np.errstate(all="ignore"):  # a point on an epipole
-        distances = np.concatenate(
-            [
-                np.abs(table.sampson(F, q1, np.ascontiguousarray(np.roll(q2, shift, axis=1)))[0][0])
-                for shift in _shifts(q1.shape[1])
-            ]
-        )
-    return _share_within(distances, limit)
+        squared = np.concatenate([table.sampson_side(F, e2, q1, own)[0] for own in rolled])
+    return _share_within(np.sqrt(squared), limit)
+
+
+@cache
+def _function() -> Any:
+    function = library().eg_chance_agreement
+    pointer, size = ctypes.c_void_p, ctypes.c_ssize_t
+    function.argtypes = [size, *[pointer] * 3, ctypes.c_double, size, size]
+    function.restype = ctypes.c_double
+    return function
 
 
 def chance_on_plane(table: Table, H: Array, q1: Array, q2: Array, limit: float) -> float:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge.kernels import Table
 from epigauge.linear import Levenberg
-from epigauge.two_view import native
+from epigauge.two_view import mixture_native
 from epigauge.two_view.conditioning import RMS
 from epigauge.two_view.criteria import Reprojection
 from epigauge.two_view.eliminated import EliminatedProblem
@@ -46,6 +46,9 @@ _SHARES = (0.02, 0.999)
 #: Climbing ends when the logarithm of the likelihood grows by less; one is a standard deviation.
 _CLIMBED = 1e-3
 _CLIMBS = 20
+
+#: Of a fit while climbing.
+_STOPPING = lm.Stopping(ftol=1e-6, max_iter=10)
 
 #: Subsets drawn a round, by their size, how many of the best are climbed, and rounds at most.
 _SIZES = (8, 12, 20, 40)
@@ -140,6 +143,9 @@ class Consensus:
         Scores are to be compared for one extent only. A small one sees no more of the wrong matches
         than how dense they are beside the epipolar lines.
         """
+        if self.criterion.kernels.compiled:
+            judged = mixture_native.judge(*self._q, F, (sigma, share), self._options(extent))
+            return Agreement(*judged, extent)
         signed, oriented = self.measured(F)
         there = np.abs(signed) < 1.0 / _FLOOR
         near = np.abs(signed) <= extent if extent < RANGE else np.ones(len(signed), np.bool_)
@@ -164,10 +170,8 @@ class Consensus:
     def measured(self, F: Array) -> tuple[Array, Mask]:
         """Return exact distances, and which matches can lie in front of both cameras."""
         if self.criterion.kernels.compiled:
-            signed, side = native.measure(F, self.criterion.q1, self.criterion.q2)
-            oriented = side > 0.0 if np.sum(np.sign(side)) >= 0.0 else side < 0.0
-        else:
-            signed, oriented = self.criterion.evaluate(F).signed, self.oriented(F)
+            return mixture_native.judge(*self._q, F, None, self._options(RANGE))[1:3]
+        signed, oriented = self.criterion.evaluate(F).signed, self.oriented(F)
         # A match without a distance (beside a degenerate F) agrees with nothing.
         return signed, np.asarray(oriented & (np.abs(signed) < 1.0 / _FLOOR))
 
@@ -176,6 +180,10 @@ class Consensus:
 
         F by least squares, each match weighing as it is probably right: expectation maximisation.
         """
+        if self.criterion.kernels.compiled:
+            known = mixture_native.Judged(*(getattr(start, name) for name in _JUDGED))
+            found = mixture_native.climb(*self._q, known, self._options(RANGE))
+            return start if found.score == start.score else Agreement(*found)
         best = start
         for _ in range(_CLIMBS):
             squared = np.where(best.oriented, best.signed, 0.0) ** 2
@@ -188,15 +196,18 @@ class Consensus:
 
     def _fitted(self, F: Array, weights: Array) -> Array:
         """Return the geometry of least squares near one."""
-        stopping, start = lm.Stopping(ftol=1e-6, max_iter=10), self.chart.start(F)
-        criterion = self.criterion
-        if criterion.kernels.compiled:
-            choices = ("reprojection", "linear", "levenberg", True)
-            matches = (criterion.q1, criterion.q2, weights)
-            found = native.minimize(self.chart, start, matches, choices, 1.0, stopping, 1.0)
-            return np.asarray(found.state.F)
-        problem = EliminatedProblem(criterion, self.chart, weights, Loss("linear"), exact=True)
-        return np.asarray(lm.minimize(problem, start, Levenberg(), lm.Classic(), stopping).state.F)
+        problem = EliminatedProblem(self.criterion, self.chart, weights, Loss("linear"), exact=True)
+        start = self.chart.start(F)
+        found = lm.minimize(problem, start, Levenberg(), lm.Classic(), _STOPPING)
+        return np.asarray(found.state.F)
+
+    @property
+    def _q(self) -> tuple[Array, Array]:
+        return self.criterion.q1, self.criterion.q2
+
+    def _options(self, extent: float) -> mixture_native.MixtureOptions:
+        numbers = (extent, RANGE, self.widest, _FLOOR, *_SHARES, _CLIMBED, _STOPPING.ftol)
+        return mixture_native.MixtureOptions(*numbers, _CLIMBS, _STOPPING.max_iter)
 
     def search(self, starts: Iterable[Agreement], rng: np.random.Generator) -> Agreement:
         """Climb from the starts, and from what subsets of the right matches lead to."""
@@ -273,6 +284,10 @@ class Consensus:
         # (e' x q') . (F q)
         sign = np.sum(np.cross(epipole, self.h2, axisb=0, axisc=0) * line, axis=0)
         return np.asarray(sign > 0.0 if np.sum(np.sign(sign)) >= 0.0 else sign < 0.0)
+
+
+#: Fields of an agreement that the compiled code knows, in its order.
+_JUDGED = mixture_native.Judged._fields
 
 
 def _score(agreement: Agreement) -> float:

@@ -85,6 +85,7 @@ def express(
     complete = partial(completed, pair, 0, x1, x2, kept, options, noise_px)
     if options.criterion != "reprojection":
         return FundamentalResult.partial(known, complete)
+    known["_pair"] = pair
 
     def history() -> SimpleNamespace:
         return SimpleNamespace(history=lm.rows(pair.history[:nfev], scale**2))

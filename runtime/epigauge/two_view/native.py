@@ -35,7 +35,6 @@ __all__ = [
     "Minimum",
     "Pair",
     "PairOptions",
-    "measure",
     "minimize",
     "pair_options",
     "refine_pairs",
@@ -69,34 +68,6 @@ class _Outcome(ctypes.Structure):
         *((name, ctypes.c_double * n) for name, n in (("diagonal", 7), ("bend", 343))),
         *((name, ctypes.c_double * n) for name, n in (("normal", 81), ("F", 9))),
     )
-
-
-@cache
-def _measure() -> Any:
-    function = library().eg_measure
-    function.argtypes = [ctypes.c_ssize_t, *[ctypes.c_void_p] * 5]
-    function.restype = None
-    return function
-
-
-def measure(F: Array, q1: Array, q2: Array) -> tuple[Array, Array]:
-    """Return the signed exact distances of matches, and on which side of the epipoles they are.
-
-    Parameters
-    ----------
-    F : ndarray, shape (3, 3)
-        Fundamental matrix.
-    q1, q2 : ndarray, shape (2, m)
-        Conditioned matches, contiguous.
-
-    Returns
-    -------
-    ndarray, shape (m,), ndarray, shape (m,)
-        Distances, and (e' x q') . (F q), whose sign points in front of both cameras share.
-    """
-    F, signed, side = np.ascontiguousarray(F), *np.empty((2, q1.shape[1]))
-    _measure()(q1.shape[1], *map(address, (F, q1, q2, signed, side)))
-    return signed, side
 
 
 @cache

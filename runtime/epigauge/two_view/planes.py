@@ -18,10 +18,13 @@ from epigauge.two_view.evidence import ROUNDING, WITHIN, Evidence
 from epigauge.two_view.homography import fit_homography, robust_homography
 
 __all__ = [
+    "BESIDE",
     "FAR_OFF",
     "HIDDEN",
     "MOST_ON",
     "OFF_PLANE",
+    "PLAINLY",
+    "PLENTY",
     "POOL",
     "REACH",
     "RELIEF",
@@ -72,7 +75,7 @@ _FEW_FAR = 0.02
 #: side by side, as a share of the range.
 _EPIPOLE = 2
 _BY_CHANCE = 0.01
-_BESIDE = 0.01
+BESIDE = 0.01
 
 #: Matches off a plane by no more than so many times the distance of an inlier are its relief where
 #: they are more than this share of the inliers.
@@ -81,7 +84,7 @@ _FEW_SLIGHT = 0.1
 
 
 #: So many places off any plane are plainly relief, if they are so many times what chance explains.
-_PLENTY, _PLAINLY = 40, 8.0
+PLENTY, PLAINLY = 40, 8.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,12 +131,12 @@ def is_plain_relief(found: Evidence) -> bool:
     """
     rows, on = on_a_plane(found)
     q = np.concatenate([found.q1, found.q2])[:, rows[~on]]
-    places = len(np.unique(np.round(q / (_BESIDE * RANGE)), axis=1).T)
-    if places < _PLENTY or np.mean(on) >= MOST_ON:
+    places = len(np.unique(np.round(q / (BESIDE * RANGE)), axis=1).T)
+    if places < PLENTY or np.mean(on) >= MOST_ON:
         return False
     limit, share = found.limit, len(rows) / found.q1.shape[1]
     chance = chance_agreement(found.table, found.F, found.all1, found.all2, limit)
-    return bool(places > _PLAINLY * share * chance * found.rejected)
+    return bool(places > PLAINLY * share * chance * found.rejected)
 
 
 def on_a_plane(found: Evidence) -> tuple[NDArray[np.intp], Mask]:
@@ -288,7 +291,7 @@ def _one_of_each(q1: Array, q2: Array) -> Mask:
     """Return one match of each place."""
     kept = np.zeros(q1.shape[1], np.bool_)
     for k in range(len(kept)):
-        beside = [np.abs(q[:, kept] - q[:, [k]]) <= _BESIDE * RANGE for q in (q1, q2)]
+        beside = [np.abs(q[:, kept] - q[:, [k]]) <= BESIDE * RANGE for q in (q1, q2)]
         kept[k] = not np.all(np.vstack(beside), axis=0).any()
     return kept
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -20,14 +21,25 @@ from epigauge import verdicts
 from epigauge._library import address, library
 from epigauge._native import check_sizes
 from epigauge.two_view import native
-from epigauge.two_view.chance import PAIRS, RANK, SIGNIFICANT, log10_false_alarms
+from epigauge.two_view.chance import CEILING, PAIRS, RANK, SIGNIFICANT, log10_false_alarms
 from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.diagnostics import AFFINE, PIXELS, REDUNDANCY, WEAK, planar_bound
 from epigauge.two_view.evidence import WITHIN
-from epigauge.two_view.planes import FAR_OFF, HIDDEN, MOST_ON, POOL, REACH, SAMPLES
+from epigauge.two_view.planes import (
+    BESIDE,
+    FAR_OFF,
+    HIDDEN,
+    MOST_ON,
+    PLAINLY,
+    PLENTY,
+    POOL,
+    REACH,
+    SAMPLES,
+)
 from epigauge.two_view.suspicion import FOURTH, TAIL, TAIL_SHARE, WIDE
+from epigauge.verdicts import ordered
 
-__all__ = ["Facts", "flags", "verdicts_of"]
+__all__ = ["Facts", "flags", "verdict_of_raw", "verdicts_of"]
 
 Array = NDArray[np.float64]
 
@@ -68,7 +80,9 @@ class Facts(NamedTuple):
         Where it does, the sum of squares to the best homography.
     chance, near, repeated : float
         Where the noise is wide, the probability that a wrong match agrees, how many matches do, and
-        how many points of an image are there more than once (all matches count here).
+        how many points of an image are there more than once.
+    places : float
+        In how many places matches are off the plane of `on_plane`.
     """
 
     number: float
@@ -85,18 +99,20 @@ class Facts(NamedTuple):
     chance: float
     near: float
     repeated: float
+    places: float
 
 
 class _Options(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_double) for name in ("within", "wide", "hidden", "tail", "reach", "far")),
         *((name, ctypes.c_ssize_t) for name in ("samples", "pool", "pairs", "rank")),
+        ("beside", ctypes.c_double),
+        ("searched", ctypes.c_ssize_t),
     )
 
 
-_OPTIONS = _Options(
-    *(WITHIN, WIDE * RANGE, HIDDEN * RANGE, TAIL, REACH, FAR_OFF), *(SAMPLES, POOL, PAIRS, RANK)
-)
+_NUMBERS = (WITHIN, WIDE * RANGE, HIDDEN * RANGE, TAIL, REACH, FAR_OFF, SAMPLES, POOL, PAIRS, RANK)
+_OPTIONS, _SEARCHED = (_Options(*_NUMBERS, BESIDE * RANGE, searched) for searched in (0, 1))
 
 
 @cache
@@ -129,26 +145,95 @@ def verdicts_of(
     list of (tuple of str or None, bool)
         One entry a pair; flags are None where these tests do not suffice.
     """
+    found: list[tuple[tuple[str, ...] | None, bool]] = []
+    rows = _facts(pair, x1, x2, offsets, weights, pair.distances, _OPTIONS)
+    for row, scale, own in zip(
+        rows, pair.table[:, 35].tolist(), pair.numbers.tolist(), strict=True
+    ):
+        raised = None if own[0] else flags(Facts(*row), scale)
+        success = raised is not None and own[4] > 0 and verdicts.usable(raised, "F")
+        found.append((raised, success))
+    return found
+
+
+def verdict_of_raw(
+    pair: native.Pair,
+    matches: tuple[Array, Array, Array],
+    distances: Array,
+    agreeing: NDArray[np.bool_],
+    limit_px: float,
+    chance: Callable[[], float],
+) -> tuple[tuple[str, ...] | None, bool]:
+    """Return flags and success of a pair by all of its raw matches.
+
+    Parameters
+    ----------
+    pair : native.Pair
+        F, fitted to those that agree.
+    matches : (ndarray, ndarray, ndarray)
+        All different matches x1, x2 (m, 2) in pixels, contiguous, and their weights (m,).
+    distances : ndarray, shape (m,)
+        Their distances from F in pixels.
+    agreeing : ndarray of bool, shape (m,)
+        Which of them agree with F: within a limit, and oriented.
+    limit_px : float
+        The limit.
+    chance : callable
+        Returns the probability that a wrong match agrees (`chance.chance_agreement`).
+    """
+    x1, x2, weights = matches
+    counts, agreed = weights > 0.0, np.where(agreeing, weights, 0.0)
+    if np.count_nonzero(agreed) < _FREE + REDUNDANCY:
+        return None, False
+    row = _facts(
+        pair,
+        *(x1, x2, np.array([0, len(x1)], np.intp)),
+        agreed,
+        distances,
+        _SEARCHED,
+    )[0]
+    own, scale = Facts(*row), float(pair.table[0, 35])
+    if limit_px > CEILING * RANGE * scale:
+        return None, False
+    if own.squares > (own.number - _FREE) * (HIDDEN * RANGE) ** 2:
+        return None, False
+    plain = _plain_flags(own, scale)
+    if plain is None or own.on_plane >= MOST_ON or own.places < PLENTY:
+        return None, False
+    m, n = int(np.count_nonzero(counts)), int(own.number)
+    wrong, copies = chance(), int(own.repeated)
+    if log10_false_alarms(m - copies, n - copies, wrong) > SIGNIFICANT:
+        return None, False
+    judges = -(-n // -(-n // POOL))
+    if own.places <= PLAINLY * (judges / n) * wrong * (m - n):
+        return None, False
+    return plain, int(pair.numbers[0, 4]) > 0 and verdicts.usable(plain, "F")
+
+
+def _facts(
+    pair: native.Pair,
+    x1: Array,
+    x2: Array,
+    offsets: NDArray[np.intp],
+    weights: Array | None,
+    distances: Array,
+    options: _Options,
+) -> list[list[float]]:
+    """Return the facts of each pair."""
     n = len(offsets) - 1
     table = np.empty((n, len(Facts._fields)))
     done = _function()(
         n,
         *map(address, (offsets, x1, x2, weights, pair.numbers)),
         pair.numbers.shape[1],
-        *map(address, (pair.distances, pair.table)),
-        ctypes.addressof(_OPTIONS),
+        *map(address, (distances, pair.table)),
+        ctypes.addressof(options),
         address(table),
     )
     if not done:
         raise MemoryError(f"no room for {len(x1)} matches")
-    found: list[tuple[tuple[str, ...] | None, bool]] = []
-    for row, scale, own in zip(
-        table.tolist(), pair.table[:, 35].tolist(), pair.numbers.tolist(), strict=True
-    ):
-        raised = None if own[0] else flags(Facts(*row), scale)
-        success = raised is not None and own[4] > 0 and verdicts.usable(raised, "F")
-        found.append((raised, success))
-    return found
+    rows: list[list[float]] = table.tolist()
+    return rows
 
 
 def flags(own: Facts, scale: float) -> tuple[str, ...] | None:
@@ -166,25 +251,34 @@ def flags(own: Facts, scale: float) -> tuple[str, ...] | None:
     tuple of str or None
         As `diagnostics.diagnose` returns them for F of seven parameters, least squares, one start.
     """
-    n, squares = int(own.number), own.squares
-    if n - _FREE < REDUNDANCY or own.unoriented or own.extent * scale < PIXELS:
+    found = _plain_flags(own, scale)
+    if found is None or own.tail > TAIL_SHARE * (1.0 - _CLOSE) * own.squares:
         return None
-    noise2 = squares / (n - _FREE)
+    n = int(own.number)
+    noise2 = own.squares / (n - _FREE)
     noise = math.sqrt(noise2)
-    if noise < _EXACT or not own.least > 0.0:
-        return None
-    weak = noise2 > WEAK**2 * own.least
-    if own.tail > TAIL_SHARE * (1.0 - _CLOSE) * squares:
-        return None
     if noise > WIDE * RANGE and not _is_plainly_common(own):
         return None
     if noise > HIDDEN * RANGE:
         bound = planar_bound(n, _FREE) * noise2
         if abs(own.plane - bound) < _CLOSE * bound:
             return None
-        weak = weak or own.plane <= bound
+        if own.plane <= bound:
+            return ordered({"weak geometry", *found})
     elif own.on_plane >= MOST_ON:
         return None
+    return found
+
+
+def _plain_flags(own: Facts, scale: float) -> tuple[str, ...] | None:
+    """Return what the size of the covariance and an affine F say; None where that is not all."""
+    n, squares = int(own.number), own.squares
+    if n - _FREE < REDUNDANCY or own.unoriented or own.extent * scale < PIXELS:
+        return None
+    noise2 = squares / (n - _FREE)
+    if noise2 < _EXACT**2 or not own.least > 0.0:
+        return None
+    weak = noise2 > WEAK**2 * own.least
     affine = own.affine <= squares + AFFINE * noise2
     return ("weak geometry",) * weak + ("near-affine",) * affine
 

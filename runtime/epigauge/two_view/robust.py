@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, ClassVar, Literal, NamedTuple, Unpack
 
@@ -15,6 +16,8 @@ from epigauge._arguments import as_array, as_count, as_matches, as_positive, as_
 from epigauge._logged import logged
 from epigauge._options import FrontEnd, RefineOptions, known_options
 from epigauge.errors import ArgumentError
+from epigauge.two_view import quick
+from epigauge.two_view.chance import chance_agreement
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.consensus import RANGE, WIDEST, Agreement, Consensus
 from epigauge.two_view.copies import earliest
@@ -243,6 +246,15 @@ def estimated(
             agreed = consensus.judge(agreement.F, agreement.sigma, agreement.share)
             bound = max(limit, _at_most(agreed.mixture.even))
         agreeing = agreed.inliers(bound)  # where fewer than 8, "no common geometry"
+        pair = vars(refined).get("_pair")
+        if pair is not None:  # cheap tests, where they suffice
+            flags, success = quick.verdict_of_raw(
+                *(pair, (raw.x1, raw.x2, raw.weights), frame.scale * agreed.signed, agreeing),
+                bound * frame.scale,
+                partial(chance_agreement, table, agreed.F, *q, bound),
+            )
+            if flags is not None:
+                return SimpleNamespace(flags=flags, success=success)
         return _judged(refined, raw, agreeing, bound * frame.scale)
 
     return Estimate(

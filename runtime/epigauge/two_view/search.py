@@ -243,23 +243,16 @@ class _Search:
         self, F: Array, q: Array, scale: float | None = None, floor: float = _FLOOR
     ) -> Array:
         """Return the scores of many F, shape (k, 3, 3)."""
-        one = np.ones((1, q.shape[1]))
-        q1, q2 = np.concatenate([q[:2], one]), np.concatenate([q[2:], one])
-        line2, line1 = F @ q1, np.swapaxes(F, 1, 2) @ q2
-        C = np.sum(line2 * q2, axis=1)
-        length2 = np.sum(line2[:, :2] ** 2, axis=1) + np.sum(line1[:, :2] ** 2, axis=1)
         scale2 = (self.scale if scale is None else scale) ** 2
-        ratio = scale2 * length2 / (C**2 + floor * scale2 * length2 + 1e-300)
-        return np.asarray(np.sum(np.log1p(ratio), axis=1))
+        q1, q2 = q[:2], q[2:]
+        factors = [self.kernels.agreement(one, scale2, floor * scale2, q1, q2) for one in F]
+        return np.asarray([float(np.sum(np.log(own))) for own in factors])
 
     def distances(self, F: Array) -> Array:
         """Return squared distances; infinity for matches on the wrong side of an epipole."""
-        one = np.ones((1, self.q.shape[1]))
-        q1, q2 = np.concatenate([self.q[:2], one]), np.concatenate([self.q[2:], one])
-        line2, line1 = F @ q1, F.T @ q2
-        length2 = np.sum(line2[:2] ** 2, axis=0) + np.sum(line1[:2] ** 2, axis=0)
-        squared = np.sum(line2 * q2, axis=0) ** 2 / (length2 + 1e-300)
-        side = np.sum(np.cross(_epipole(F), q2, axisb=0, axisc=0) * line2, axis=0) > 0.0
+        e2 = self.kernels.epipole(F)
+        squared, side = self.kernels.sampson_side(F, e2, self.q[:2], self.q[2:])
+        side = side > 0.0
         most = 2 * np.count_nonzero(side) >= len(side)
         return np.where(side == most, squared, np.inf)
 
@@ -336,7 +329,7 @@ class _Search:
         if len(rows) < 7:
             return 0, np.eye(3)
         limit = 3.0 * self.scale * 2.0**0.5
-        e2 = _epipole(self.F)
+        e2 = self.kernels.epipole(self.F)
         e2 /= np.linalg.norm(e2)
         q1, q2 = self.q[:, rows].reshape(2, 2, -1)
         kappa, gain = self.kernels.plane_parallax(self.F, e2, q1, q2)
@@ -389,12 +382,6 @@ class _Search:
             F = np.cross(e2[:, :, None], H[None], axis=1)
             # Matches on the plane, as most of the few judges are, say nothing.
             highest = self.best_of(_normalized(F), _BATCH, highest)
-
-
-def _epipole(F: Array) -> Array:
-    """Return the epipole in the second image, of any length."""
-    candidates = np.cross(F, np.roll(F, -1, axis=1), axis=0)
-    return np.asarray(candidates[:, np.argmax(np.sum(candidates**2, axis=0))])
 
 
 def _normalized(F: Array) -> Array:

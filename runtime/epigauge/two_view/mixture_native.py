@@ -1,0 +1,107 @@
+"""The likelihood of all matches by the compiled code: what `consensus.Consensus` does in Python."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge._library import address, library
+from epigauge._native import check_sizes
+
+__all__ = ["Judged", "MixtureOptions", "climb", "judge"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class MixtureOptions(ctypes.Structure):
+    """The eg_mixture_options of two_view.h."""
+
+    _fields_ = (
+        *((name, ctypes.c_double) for name in ("extent", "range", "widest", "floor")),
+        *((name, ctypes.c_double) for name in ("least", "most", "climbed", "ftol")),
+        *((name, ctypes.c_int) for name in ("climbs", "steps")),
+    )
+
+
+class Judged(NamedTuple):
+    """What is known of a geometry F, as in `consensus.Agreement`."""
+
+    F: Array
+    signed: Array
+    oriented: Mask
+    sigma: float
+    share: float
+    score: float
+
+
+@cache
+def _functions() -> tuple[Any, Any]:
+    check_sizes({"eg_mixture_options": MixtureOptions})
+    judge_, climb_ = library().eg_judge, library().eg_climb
+    for function in (judge_, climb_):
+        function.argtypes = [ctypes.c_ssize_t, *[ctypes.c_void_p] * 7]
+    return judge_, climb_
+
+
+def judge(
+    q1: Array,
+    q2: Array,
+    F: Array,
+    fitted: tuple[float, float] | None,
+    options: MixtureOptions,
+) -> Judged:
+    """Measure the matches; fit deviation and share from some, where these are given.
+
+    Parameters
+    ----------
+    q1, q2 : ndarray, shape (2, m)
+        Conditioned matches, contiguous.
+    F : ndarray, shape (3, 3)
+        Fundamental matrix.
+    fitted : (float, float) or None
+        Deviation of right distances and their share.
+    options : MixtureOptions
+        How.
+    """
+    m = q1.shape[1]
+    numbers = np.array([*(fitted or (0.0, 0.0)), 0.0])
+    matrix, signed, oriented = np.ascontiguousarray(F), np.empty(m), np.empty(m, np.bool_)
+    done = _functions()[0](
+        m,
+        *map(address, (matrix, q1, q2)),
+        ctypes.addressof(options),
+        *map(address, (None if fitted is None else numbers, signed, oriented)),
+    )
+    if not done:
+        raise MemoryError(f"no room for {m} matches")
+    return Judged(F, signed, oriented, *numbers.tolist())
+
+
+def climb(q1: Array, q2: Array, start: Judged, options: MixtureOptions) -> Judged:
+    """Maximise the likelihood over F, deviation and share in turns.
+
+    Parameters
+    ----------
+    q1, q2 : ndarray, shape (2, m)
+        Conditioned matches, contiguous.
+    start : Judged
+        From where.
+    options : MixtureOptions
+        How.
+    """
+    numbers = np.array([start.sigma, start.share, start.score])
+    F, signed, oriented = start.F.copy(), start.signed.copy(), start.oriented.copy()
+    done = _functions()[1](
+        q1.shape[1],
+        *map(address, (q1, q2)),
+        ctypes.addressof(options),
+        *map(address, (F, numbers, signed, oriented)),
+    )
+    if not done:
+        raise MemoryError(f"no room for {q1.shape[1]} matches")
+    return Judged(F, signed, oriented, *numbers.tolist())
