@@ -1213,6 +1213,26 @@ EG_EXPORT void eg_line_tangent(
     const double *EG_RESTRICT origin,
     double *EG_RESTRICT T);
 
+EG_EXPORT void eg_line_unit_tangent(
+    ptrdiff_t n,
+    const double *EG_RESTRICT line,
+    const double *EG_RESTRICT origin,
+    double *EG_RESTRICT T);
+
+EG_EXPORT void eg_point_line_distance(
+    ptrdiff_t n,
+    const double *EG_RESTRICT X,
+    const double *EG_RESTRICT line,
+    double *EG_RESTRICT d,
+    double *EG_RESTRICT J);
+
+EG_EXPORT void eg_line_angle(
+    ptrdiff_t n,
+    const double *EG_RESTRICT line,
+    const double *EG_RESTRICT other,
+    double *EG_RESTRICT a,
+    double *EG_RESTRICT J);
+
 EG_EXPORT void eg_line_generators(
     ptrdiff_t n,
     const double *EG_RESTRICT line,

@@ -1033,6 +1033,24 @@ SIGNATURES = {
         (Argument("T", (6, 4), True), ),
         "derivative of the line by that update, at none.",
     ),
+    "line_unit_tangent": Signature(
+        "lines",
+        (Argument("line", (6,), True), Argument("origin", (3,), True), ),
+        (Argument("T", (6, 4), True), ),
+        "derivative by that update, at none, of the line over the length of its direction.",
+    ),
+    "point_line_distance": Signature(
+        "lines",
+        (Argument("X", (3,), True), Argument("line", (6,), True), ),
+        (Argument("d", (1,), True), Argument("J", (9,), True), ),
+        "distance |X x v - n| / |v| of a point from a line, and its derivatives by the point and the line.",
+    ),
+    "line_angle": Signature(
+        "lines",
+        (Argument("line", (6,), True), Argument("other", (6,), True), ),
+        (Argument("a", (1,), True), Argument("J", (12,), True), ),
+        "angle of two lines, at most 90 degrees, and its derivatives by both lines.",
+    ),
     "line_generators": Signature(
         "lines",
         (Argument("line", (6,), True), Argument("origin", (3,), True), ),

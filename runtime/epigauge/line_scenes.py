@@ -15,6 +15,9 @@ from epigauge.scenes import _looking_at_origin
 
 __all__ = ["LineScene", "line_scene"]
 
+#: A segment is so many times as long as its noise at least; how often other lines are tried.
+_LENGTH, _TRIES = 10.0, 100
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineScene:
@@ -49,7 +52,7 @@ def line_scene(
 
     Equal cameras on three quarters of a circle, at changing heights, look at the cube's centre. Of
     each line a view sees the image of a random part of a piece one side of the cube long, both of
-    its end points with noise.
+    its end points with noise. No view sees a line nearly end on.
 
     Parameters
     ----------
@@ -100,9 +103,7 @@ def line_scene(
     t = -np.einsum("nij,nj->ni", R, centres)
     X = cube * random.uniform(-0.5, 0.5, (n_points, 3))
     middle = cube * random.uniform(-0.5, 0.5, (n_lines, 3))
-    v = random.standard_normal((n_lines, 3))
-    v /= np.linalg.norm(v, axis=1, keepdims=True)
-    lines = np.column_stack([np.cross(middle, v), v])
+    v = _directions(random, n_lines)
 
     def seen(points: np.ndarray) -> np.ndarray:
         """Return the images (k, n, 2) of points (k, n, 3), one a view."""
@@ -114,12 +115,31 @@ def line_scene(
     # From where to where on the line: each view sees a third of the piece at least.
     begin = cube * random.uniform(-0.5, 0.0, (n_lines, n_views, 1))
     end = begin + cube * random.uniform(1.0 / 3.0, 0.5, (n_lines, n_views, 1))
-    ends = [seen(middle[:, None] + s * v[:, None]) for s in (begin, end)]
-    segments = np.concatenate(ends, axis=2)
+
+    def images() -> np.ndarray:
+        """Return the exact segments, (k, n, 4)."""
+        ends = [seen(middle[:, None] + s * v[:, None]) for s in (begin, end)]
+        return np.concatenate(ends, axis=2)
+
+    segments = images()
+    for _ in range(_TRIES):
+        long = np.linalg.norm(segments[..., 2:] - segments[..., :2], axis=2).min(axis=1)
+        end_on = np.flatnonzero(long < _LENGTH * noise_px)
+        if not len(end_on):
+            break
+        v[end_on] = _directions(random, len(end_on))
+        segments = images()
     segments += noise_px * random.standard_normal(segments.shape)
     point, view = np.divmod(np.arange(n_points * n_views), n_views)
     tracks = Tracks(view, point, xy.reshape(-1, 2))
     line, view = np.divmod(np.arange(n_lines * n_views), n_views)
     line_tracks = LineTracks(view, line, segments.reshape(-1, 4))
     cameras = Cameras("SIMPLE_PINHOLE", np.array([[focal, 0.0, 0.0]]), np.zeros(n_views, np.intp))
+    lines = np.column_stack([np.cross(middle, v), v])
     return LineScene(tracks, line_tracks, MetricReconstruction(R, t, X, cameras, lines))
+
+
+def _directions(random: np.random.Generator, count: int) -> np.ndarray:
+    """Return random unit vectors, (k, 3)."""
+    v = random.standard_normal((count, 3))
+    return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True))

@@ -22,7 +22,7 @@ from epigauge.bundle.run import bundle_problem
 from epigauge.bundle.skyline import Skyline
 from epigauge.two_view.losses import Loss
 from epigauge.uncertainty.datum import projection
-from epigauge.uncertainty.inverse import Inverse, Part
+from epigauge.uncertainty.inverse import Inverse, Motions, Part
 from numpy.typing import NDArray
 
 from tests.metric_scenes import METRIC, metric_scene
@@ -111,7 +111,8 @@ class Network:
         )
         self.system = problem.linearize(problem.evaluate(Estimate(*self.at)))
         self.reference = NumpyLinearizer(job.model, table, graph, job.q, weights, Loss())
-        self.inverse = Inverse.of(self.system, self.reference, priors, table)
+        motions = Motions.of(self.system, priors, table)
+        self.inverse = Inverse.of(self.system, self.reference, priors, motions)
         self.n, self.d = self.system.normal.g_cameras.shape
         self.m = tracks.n_points
 

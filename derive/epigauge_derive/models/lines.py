@@ -74,6 +74,61 @@ def tangent() -> sp.Matrix:
     return at(jacobian(list(_updated(delta)), delta), dict.fromkeys(delta, sp.S.Zero))
 
 
+def _unit_tangent() -> sp.Matrix:
+    """Return the derivative by its update of the line over the length of its direction, 6x4."""
+    delta = DELTA.entries()
+    moved = _updated(delta)
+    length = sp.sqrt(sum(entry**2 for entry in moved[3:, :]))
+    unit = list(moved / length)
+    return at(jacobian(unit, delta), dict.fromkeys(delta, sp.S.Zero))
+
+
+def _measures() -> list[Kernel]:
+    """Return what is measured between points and lines of space, and its derivatives."""
+    n, v = _halves(LINE.matrix())
+    X = Input("X", (3,), names=("x", "y", "z"))
+    other = Input("other", (6,), names=("mx", "my", "mz", "ux", "uy", "uz"))
+    _, u = _halves(other.matrix())
+    apart, across = sp.symbols("apart0:3", real=True), sp.symbols("across0:3", real=True)
+    offset = cross(X.entries()) * v - n
+    turned = cross(list(v)) * u
+    distance = sp.sqrt(sum(a**2 for a in apart)) / sp.sqrt(sum(entry**2 for entry in v))
+    by_apart = jacobian([distance], apart)
+    by_offset = jacobian(list(offset), [*X.entries(), *LINE.entries()])
+    direct = jacobian([distance], list(v))
+    slope = by_apart * by_offset
+    slope[:, 6:] += direct
+    cosine = sum(a * b for a, b in zip(v, u, strict=True))
+    sine = sp.sqrt(sum(a**2 for a in across))
+    angle = sp.atan2(sine, sp.sqrt(cosine**2))
+    # Of unit directions: d angle = -(sign of the cosine) / sine times the change of the cosine.
+    size = sum(entry**2 for entry in v), sum(entry**2 for entry in u)
+    side = cosine / sp.sqrt(cosine**2)
+    by_v = -(u - cosine / size[0] * v).T * side / sine
+    by_u = -(v - cosine / size[1] * u).T * side / sine
+    none = sp.zeros(1, 3)
+    return [
+        Kernel(
+            "point_line_distance",
+            "distance |X x v - n| / |v| of a point from a line, and its derivatives by the point "
+            "and the line.",
+            (X, LINE),
+            (Output.of("d", [distance]), Output.of("J", list(slope))),
+            (Let(dict(zip(apart, offset, strict=True))),),
+        ),
+        Kernel(
+            "line_angle",
+            "angle of two lines, at most 90 degrees, and its derivatives by both lines.",
+            (LINE, other),
+            (
+                Output.of("a", [angle]),
+                Output.of("J", list(none.row_join(by_v).row_join(none).row_join(by_u))),
+            ),
+            (Let(dict(zip(across, turned, strict=True))),),
+        ),
+    ]
+
+
 def _coordinates(velocity: sp.Matrix) -> sp.Matrix:
     """Return the update that a velocity (n', v') of the line is; a change of scale is none.
 
@@ -215,6 +270,14 @@ def kernels() -> list[Kernel]:
             (Output.of("T", tangent()),),
             (_local(),),
         ),
+        Kernel(
+            "line_unit_tangent",
+            "derivative by that update, at none, of the line over the length of its direction.",
+            (LINE, ORIGIN),
+            (Output.of("T", _unit_tangent()),),
+            (_local(),),
+        ),
+        *_measures(),
         Kernel(
             "line_generators",
             f"updates of a line by the gauge of poses: {', '.join(name for name, _ in fields)}.",

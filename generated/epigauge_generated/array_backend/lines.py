@@ -170,6 +170,187 @@ def line_tangent(xp, line, origin):
     )
 
 
+def line_unit_tangent(xp, line, origin):
+    # Formula: derivative by that update, at none, of the line over the length of its direction.
+    # Inputs:  line (6,), origin (3,)
+    # Outputs: T (6, 4)
+    # Operations: 194, temporaries: 51.
+    nx = line[0, ...]
+    ny = line[1, ...]
+    nz = line[2, ...]
+    vx = line[3, ...]
+    vy = line[4, ...]
+    vz = line[5, ...]
+    ox = origin[0, ...]
+    oy = origin[1, ...]
+    oz = origin[2, ...]
+    t9 = vx*vx + vy*vy + vz*vz
+    t10 = xp.sqrt(t9)
+    t11 = 1.0/t10
+    length = t10
+    t0 = oz*vy
+    t1 = oy*vz
+    t2 = t0 - t1
+    moment0 = nx + t2
+    t12 = 1.0/length
+    t3 = ox*vz
+    t4 = oz*vx
+    t5 = t3 - t4
+    moment1 = ny + t5
+    t6 = oy*vx
+    t7 = ox*vy
+    t8 = t6 - t7
+    moment2 = nz + t8
+    distance = xp.sqrt(moment0*moment0 + moment1*moment1 + moment2*moment2)
+    t13 = 1.0/distance
+    t14 = t12*t13
+    t15 = moment0*t14
+    t16 = t15*vy
+    t17 = moment1*t14*vx
+    t18 = t16 - t17
+    t19 = length*t18
+    t20 = t15*vz
+    t21 = t20 - moment2*t12*t13*vx
+    t22 = -t21
+    t23 = length*oz
+    t24 = moment1*t14*vz
+    t25 = 0.5*length
+    t26 = -t25*vx*(2.0*t24 - 2.0*moment2*t14*vy) - t25*vy*(2.0*moment2*t12*t13*vx - 2.0*t20) - t25*vz*(2.0*t16 - 2.0*t17)
+    t27 = 1.0/(t9*xp.sqrt(t9))
+    t28 = t27*(moment0 + t1 - t0)
+    t29 = t24 - moment2*t12*t13*vy
+    t30 = distance*t11
+    t31 = distance*t12
+    t32 = moment1*t13
+    t33 = length*t13
+    t34 = moment2*t33
+    t35 = moment0*t33
+    t36 = length*t32
+    t37 = t34*vz + t35*vx + t36*vy
+    t38 = -t9
+    t39 = t27*(moment1 + t4 - t3)
+    t40 = length*t22
+    t41 = length*t29
+    t42 = t27*(moment2 + t7 - t6)
+    t43 = t27*vx
+    t44 = t27*vy
+    t45 = t27*vz
+    return (
+        [
+            t11*(oy*t19 - t22*t23) + t26*t28,
+            -t29*t30,
+            t11*(t23*t32 + t31*vx - oy*t34) + t28*t37,
+            t11*(-moment0 - t2) + t28*t38,
+            t11*(length*oz*t29 - ox*t19) + t26*t39,
+            t21*t30,
+            t11*(ox*t34 + t31*vy - moment0*t13*t23) + t37*t39,
+            t11*(-moment1 - t5) + t38*t39,
+            t11*(ox*t40 - oy*t41) + t26*t42,
+            -t18*t30,
+            t11*(oy*t35 + t31*vz - ox*t36) + t37*t42,
+            t11*(-moment2 - t8) + t38*t42,
+            t11*t41 + t26*t43,
+            0.0,
+            t37*t43 - t11*t35,
+            t11*vx + t38*t43,
+            t11*t40 + t26*t44,
+            0.0,
+            t37*t44 - t11*t36,
+            t11*vy + t38*t44,
+            t11*t19 + t26*t45,
+            0.0,
+            t37*t45 - t11*t34,
+            t11*vz + t38*t45,
+        ],
+    )
+
+
+def point_line_distance(xp, X, line):
+    # Formula: distance |X x v - n| / |v| of a point from a line, and its derivatives by the
+    # point and the line.
+    # Inputs:  X (3,), line (6,)
+    # Outputs: d (1,), J (9,)
+    # Operations: 73, temporaries: 12.
+    x = X[0, ...]
+    y = X[1, ...]
+    z = X[2, ...]
+    nx = line[0, ...]
+    ny = line[1, ...]
+    nz = line[2, ...]
+    vx = line[3, ...]
+    vy = line[4, ...]
+    vz = line[5, ...]
+    apart0 = vz*y - nx - vy*z
+    apart1 = vx*z - ny - vz*x
+    apart2 = vy*x - nz - vx*y
+    t0 = xp.sqrt(apart0*apart0 + apart1*apart1 + apart2*apart2)
+    t1 = vx*vx + vy*vy + vz*vz
+    t2 = 1.0/xp.sqrt(t1)
+    t3 = 1.0/t0
+    t4 = t2*t3
+    t5 = apart1*t4
+    t6 = apart0*t4
+    t7 = apart2*t4
+    t8 = t0/(t1*xp.sqrt(t1))
+    return (
+        [
+            t0*t2,
+        ],
+        [
+            apart2*t2*t3*vy - t5*vz,
+            t6*vz - t7*vx,
+            apart1*t2*t3*vx - t6*vy,
+            -t6,
+            -t5,
+            -t7,
+            apart1*t2*t3*z - t7*y - t8*vx,
+            apart2*t2*t3*x - t6*z - t8*vy,
+            apart0*t2*t3*y - t5*x - t8*vz,
+        ],
+    )
+
+
+def line_angle(xp, line, other):
+    # Formula: angle of two lines, at most 90 degrees, and its derivatives by both lines.
+    # Inputs:  line (6,), other (6,)
+    # Outputs: a (1,), J (12,)
+    # Operations: 58, temporaries: 9.
+    vx = line[3, ...]
+    vy = line[4, ...]
+    vz = line[5, ...]
+    ux = other[3, ...]
+    uy = other[4, ...]
+    uz = other[5, ...]
+    across0 = uz*vy - uy*vz
+    across1 = ux*vz - uz*vx
+    across2 = uy*vx - ux*vy
+    t0 = xp.sqrt(across0*across0 + across1*across1 + across2*across2)
+    t1 = ux*vx + uy*vy + uz*vz
+    t2 = xp.abs(t1)
+    t3 = 1.0/(vx*vx + vy*vy + vz*vz)
+    t4 = t1/(t0*t2)
+    t5 = t1/(ux*ux + uy*uy + uz*uz)
+    return (
+        [
+            xp.atan2(t0, t2),
+        ],
+        [
+            0.0,
+            0.0,
+            0.0,
+            t4*(t1*t3*vx - ux),
+            t4*(t1*t3*vy - uy),
+            t4*(t1*t3*vz - uz),
+            0.0,
+            0.0,
+            0.0,
+            t4*(t5*ux - vx),
+            t4*(t5*uy - vy),
+            t4*(t5*uz - vz),
+        ],
+    )
+
+
 def line_generators(xp, line, origin):
     # Formula: updates of a line by the gauge of poses: rotation x, rotation y, rotation z,
     # translation x, translation y, translation z, scale.

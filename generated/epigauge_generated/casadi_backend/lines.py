@@ -193,6 +193,197 @@ def line_tangent():
 
 
 @cache
+def line_unit_tangent():
+    # Formula: derivative by that update, at none, of the line over the length of its direction.
+    # Inputs:  line (6,), origin (3,)
+    # Outputs: T (6, 4)
+    # Operations: 194, temporaries: 51.
+    line = ca.SX.sym("line", 6, 1)
+    nx = line[0, 0]
+    ny = line[1, 0]
+    nz = line[2, 0]
+    vx = line[3, 0]
+    vy = line[4, 0]
+    vz = line[5, 0]
+    origin = ca.SX.sym("origin", 3, 1)
+    ox = origin[0, 0]
+    oy = origin[1, 0]
+    oz = origin[2, 0]
+    t9 = vx*vx + vy*vy + vz*vz
+    t10 = ca.sqrt(t9)
+    t11 = 1.0/t10
+    length = t10
+    t0 = oz*vy
+    t1 = oy*vz
+    t2 = t0 - t1
+    moment0 = nx + t2
+    t12 = 1.0/length
+    t3 = ox*vz
+    t4 = oz*vx
+    t5 = t3 - t4
+    moment1 = ny + t5
+    t6 = oy*vx
+    t7 = ox*vy
+    t8 = t6 - t7
+    moment2 = nz + t8
+    distance = ca.sqrt(moment0*moment0 + moment1*moment1 + moment2*moment2)
+    t13 = 1.0/distance
+    t14 = t12*t13
+    t15 = moment0*t14
+    t16 = t15*vy
+    t17 = moment1*t14*vx
+    t18 = t16 - t17
+    t19 = length*t18
+    t20 = t15*vz
+    t21 = t20 - moment2*t12*t13*vx
+    t22 = -t21
+    t23 = length*oz
+    t24 = moment1*t14*vz
+    t25 = 0.5*length
+    t26 = -t25*vx*(2.0*t24 - 2.0*moment2*t14*vy) - t25*vy*(2.0*moment2*t12*t13*vx - 2.0*t20) - t25*vz*(2.0*t16 - 2.0*t17)
+    t27 = 1.0/(t9*ca.sqrt(t9))
+    t28 = t27*(moment0 + t1 - t0)
+    t29 = t24 - moment2*t12*t13*vy
+    t30 = distance*t11
+    t31 = distance*t12
+    t32 = moment1*t13
+    t33 = length*t13
+    t34 = moment2*t33
+    t35 = moment0*t33
+    t36 = length*t32
+    t37 = t34*vz + t35*vx + t36*vy
+    t38 = -t9
+    t39 = t27*(moment1 + t4 - t3)
+    t40 = length*t22
+    t41 = length*t29
+    t42 = t27*(moment2 + t7 - t6)
+    t43 = t27*vx
+    t44 = t27*vy
+    t45 = t27*vz
+    T = ca.SX(6, 4)
+    T[0, 0] = t11*(oy*t19 - t22*t23) + t26*t28
+    T[0, 1] = -t29*t30
+    T[0, 2] = t11*(t23*t32 + t31*vx - oy*t34) + t28*t37
+    T[0, 3] = t11*(-moment0 - t2) + t28*t38
+    T[1, 0] = t11*(length*oz*t29 - ox*t19) + t26*t39
+    T[1, 1] = t21*t30
+    T[1, 2] = t11*(ox*t34 + t31*vy - moment0*t13*t23) + t37*t39
+    T[1, 3] = t11*(-moment1 - t5) + t38*t39
+    T[2, 0] = t11*(ox*t40 - oy*t41) + t26*t42
+    T[2, 1] = -t18*t30
+    T[2, 2] = t11*(oy*t35 + t31*vz - ox*t36) + t37*t42
+    T[2, 3] = t11*(-moment2 - t8) + t38*t42
+    T[3, 0] = t11*t41 + t26*t43
+    T[3, 2] = t37*t43 - t11*t35
+    T[3, 3] = t11*vx + t38*t43
+    T[4, 0] = t11*t40 + t26*t44
+    T[4, 2] = t37*t44 - t11*t36
+    T[4, 3] = t11*vy + t38*t44
+    T[5, 0] = t11*t19 + t26*t45
+    T[5, 2] = t37*t45 - t11*t34
+    T[5, 3] = t11*vz + t38*t45
+    return ca.Function(
+        "line_unit_tangent",
+        [line, origin],
+        [T],
+        ["line", "origin"],
+        ["T"],
+    )
+
+
+@cache
+def point_line_distance():
+    # Formula: distance |X x v - n| / |v| of a point from a line, and its derivatives by the
+    # point and the line.
+    # Inputs:  X (3,), line (6,)
+    # Outputs: d (1,), J (9,)
+    # Operations: 73, temporaries: 12.
+    X = ca.SX.sym("X", 3, 1)
+    x = X[0, 0]
+    y = X[1, 0]
+    z = X[2, 0]
+    line = ca.SX.sym("line", 6, 1)
+    nx = line[0, 0]
+    ny = line[1, 0]
+    nz = line[2, 0]
+    vx = line[3, 0]
+    vy = line[4, 0]
+    vz = line[5, 0]
+    apart0 = vz*y - nx - vy*z
+    apart1 = vx*z - ny - vz*x
+    apart2 = vy*x - nz - vx*y
+    t0 = ca.sqrt(apart0*apart0 + apart1*apart1 + apart2*apart2)
+    t1 = vx*vx + vy*vy + vz*vz
+    t2 = 1.0/ca.sqrt(t1)
+    t3 = 1.0/t0
+    t4 = t2*t3
+    t5 = apart1*t4
+    t6 = apart0*t4
+    t7 = apart2*t4
+    t8 = t0/(t1*ca.sqrt(t1))
+    d = ca.SX(1, 1)
+    d[0, 0] = t0*t2
+    J = ca.SX(9, 1)
+    J[0, 0] = apart2*t2*t3*vy - t5*vz
+    J[1, 0] = t6*vz - t7*vx
+    J[2, 0] = apart1*t2*t3*vx - t6*vy
+    J[3, 0] = -t6
+    J[4, 0] = -t5
+    J[5, 0] = -t7
+    J[6, 0] = apart1*t2*t3*z - t7*y - t8*vx
+    J[7, 0] = apart2*t2*t3*x - t6*z - t8*vy
+    J[8, 0] = apart0*t2*t3*y - t5*x - t8*vz
+    return ca.Function(
+        "point_line_distance",
+        [X, line],
+        [d, J],
+        ["X", "line"],
+        ["d", "J"],
+    )
+
+
+@cache
+def line_angle():
+    # Formula: angle of two lines, at most 90 degrees, and its derivatives by both lines.
+    # Inputs:  line (6,), other (6,)
+    # Outputs: a (1,), J (12,)
+    # Operations: 58, temporaries: 9.
+    line = ca.SX.sym("line", 6, 1)
+    vx = line[3, 0]
+    vy = line[4, 0]
+    vz = line[5, 0]
+    other = ca.SX.sym("other", 6, 1)
+    ux = other[3, 0]
+    uy = other[4, 0]
+    uz = other[5, 0]
+    across0 = uz*vy - uy*vz
+    across1 = ux*vz - uz*vx
+    across2 = uy*vx - ux*vy
+    t0 = ca.sqrt(across0*across0 + across1*across1 + across2*across2)
+    t1 = ux*vx + uy*vy + uz*vz
+    t2 = ca.fabs(t1)
+    t3 = 1.0/(vx*vx + vy*vy + vz*vz)
+    t4 = t1/(t0*t2)
+    t5 = t1/(ux*ux + uy*uy + uz*uz)
+    a = ca.SX(1, 1)
+    a[0, 0] = ca.atan2(t0, t2)
+    J = ca.SX(12, 1)
+    J[3, 0] = t4*(t1*t3*vx - ux)
+    J[4, 0] = t4*(t1*t3*vy - uy)
+    J[5, 0] = t4*(t1*t3*vz - uz)
+    J[9, 0] = t4*(t5*ux - vx)
+    J[10, 0] = t4*(t5*uy - vy)
+    J[11, 0] = t4*(t5*uz - vz)
+    return ca.Function(
+        "line_angle",
+        [line, other],
+        [a, J],
+        ["line", "other"],
+        ["a", "J"],
+    )
+
+
+@cache
 def line_generators():
     # Formula: updates of a line by the gauge of poses: rotation x, rotation y, rotation z,
     # translation x, translation y, translation z, scale.

@@ -7,7 +7,7 @@ similarities take it along, and the line is off it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -122,6 +122,23 @@ class LineLinearizer(NumpyLinearizer):
         A = np.zeros((2, self.model.tangent_size, r.shape[1]))
         A[:, :_POSE] = by_camera[:, :_POSE]
         return r, A, by_line
+
+    def generators(self, cameras: Array, lines: Array) -> Array:
+        """Return the velocities of lines by the gauge, as updates, (L, 4, 7)."""
+        origins = self.segments.origins(cameras, lines)
+        return np.asarray(self.kernels.line_generators(lines.T, origins.T).transpose(2, 0, 1))
+
+    def tangents(self, cameras: Array, lines: Array) -> Array:
+        """Return the derivatives of lines with unit directions by their updates, (L, 6, 4)."""
+        origins = self.segments.origins(cameras, lines)
+        return np.asarray(self.kernels.line_unit_tangent(lines.T, origins.T).transpose(2, 0, 1))
+
+    def _of_one(self, alone: ObservationGraph, rows: slice) -> LineLinearizer:
+        """Return the segments of one line, which becomes the only one."""
+        every = self.segments
+        ends, spread = every.ends[:, rows], every.spread[:, rows]
+        own = replace(every, view=alone.view, line=alone.point, ends=ends, spread=spread)
+        return replace(self, graph=alone, q=ends, segments=own)
 
     def moved(self, cameras: Array, points: Array, step: Array) -> Array:
         """Return the lines after a step of their tangents at these cameras."""

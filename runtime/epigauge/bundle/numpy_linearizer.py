@@ -146,12 +146,16 @@ class NumpyLinearizer:
         rows = slice(graph.first[point], graph.first[point + 1])
         view = graph.view[rows]
         alone = ObservationGraph(view, np.zeros(len(view), np.intp), graph.n_views, 1)
-        whitening = None if self.whitening is None else self.whitening[..., rows]
-        own = replace(self, graph=alone, q=self.q[:, rows], whitening=whitening)
+        own = self._of_one(alone, rows)
         r, A, B = own.observe(cameras, points[point][None])
         weight = self._effective(self.weights[rows], r)[1]
         W = np.einsum("kin,kjn,n->nij", A, B, weight, optimize=True)
         return alone.simple.view, alone.sum_edges(W)
+
+    def _of_one(self, alone: ObservationGraph, rows: slice) -> NumpyLinearizer:
+        """Return the observations of one point, which becomes the only one."""
+        whitening = None if self.whitening is None else self.whitening[..., rows]
+        return replace(self, graph=alone, q=self.q[:, rows], whitening=whitening)
 
     def refine_points(
         self, cameras: Array, points: Array, how: PointRefinement

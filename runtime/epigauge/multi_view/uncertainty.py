@@ -35,6 +35,7 @@ from epigauge.multi_view.datum import Projector, halves, mapped, projector
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import Gauge, identity, normalized, two_cameras
 from epigauge.multi_view.inverse import Inverse
+from epigauge.multi_view.line_tracks import LineTracks
 from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.sandwich import Sandwich
 from epigauge.multi_view.tracks import Tracks
@@ -281,6 +282,7 @@ def covariance(
     fixed_views: Iterable[int] = (),
     fixed_points: Iterable[int] = (),
     priors: Iterable[Prior] | None = None,
+    lines: LineTracks | None = None,
     backend: str | None = None,
 ) -> MetricCovariance: ...
 
@@ -317,7 +319,7 @@ def covariance(
         Observations that the reconstruction was adjusted to, with their weights: zero for those
         that were set aside.
     reconstruction : Reconstruction, MetricReconstruction or AffineReconstruction
-        Cameras and points at the minimum; adjusted without lines.
+        Cameras and points at the minimum, and lines where they were adjusted to `lines`.
     gauge : Gauge or "inner", optional
         Of a metric reconstruction, which is not moved, the datum: "inner" (default) for inner
         constraints over all points, ``eg.gauge.inner(points=..., views=...)`` over some,
@@ -342,8 +344,10 @@ def covariance(
     backend : {"c", "numpy", "casadi"}, optional
         Where the formulas are computed.
     **of_metric
-        Of a metric reconstruction `refine`, `fixed_views`, `fixed_points` and `priors`, as they
-        were given to `bundle_adjust`; of an affine one `fixed_views` and `fixed_points`.
+        Of a metric reconstruction `refine`, `fixed_views`, `fixed_points`, `priors` and `lines`, as
+        they were given to `bundle_adjust`; of an affine one `fixed_views` and `fixed_points`. With
+        lines the noise is that of both: an end point of a segment is as much more or less exact
+        than a point as the `sigma` of tracks and segments say.
 
     Returns
     -------
@@ -353,9 +357,9 @@ def covariance(
     Raises
     ------
     ArgumentError
-        If the reconstruction has another size or lines, there is nothing to estimate the noise
-        from, the observations do not determine the reconstruction, or the gauge is not one of
-        `eg.gauge` and has no method `constraints`.
+        If the reconstruction has another size, or lines and `lines` is not given, there is nothing
+        to estimate the noise from, the observations do not determine the reconstruction, or the
+        gauge is not one of `eg.gauge` and has no method `constraints`.
 
     Notes
     -----
@@ -397,9 +401,9 @@ def covariance(
         needed = "an eg.Reconstruction, MetricReconstruction or AffineReconstruction"
         raise ArgumentError("reconstruction", was, needed)
     if isinstance(reconstruction, MetricReconstruction):
-        if reconstruction.lines is not None:
+        if reconstruction.lines is not None and of_metric.get("lines") is None:
             was = f"has {len(reconstruction.lines)} lines, which count as observations, too"
-            needed = "one adjusted to points alone: eg.bundle_adjust without lines"
+            needed = "their segments, lines=...; or one adjusted to points alone"
             raise ArgumentError("reconstruction", was, needed)
         datum = "inner" if gauge is None else gauge
         options: Any = {**of_metric, "backend": backend}

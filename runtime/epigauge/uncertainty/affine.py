@@ -25,7 +25,7 @@ from epigauge.multi_view.gauge import five_points, inner
 from epigauge.multi_view.tracks import Tracks
 from epigauge.two_view.losses import Loss
 from epigauge.uncertainty.datum import Projection, onto
-from epigauge.uncertainty.inverse import Inverse
+from epigauge.uncertainty.inverse import Inverse, Motions
 from epigauge.uncertainty.metric import redundancy_of
 
 __all__ = ["AffineCovariance", "AffineStd", "affine_covariance"]
@@ -202,8 +202,9 @@ def affine_covariance(
     problem = bundle_problem(*parts, whitening=job.whitening, freedom=job.freedom)
     state = problem.evaluate(Estimate(*home.apply(job.cameras, job.points)))
     reference = NumpyLinearizer(*parts, job.whitening)
-    inverse = Inverse.of(problem.linearize(state), reference, None, table)
-    redundancy = redundancy_of(tracks, job, inverse.motions)
+    system = problem.linearize(state)
+    inverse = Inverse.of(system, reference, None, Motions.of(system, None, table))
+    redundancy = redundancy_of(np.asarray(tracks.weights), None, system, inverse.motions)
     if noise_px is not None:
         noise_px = as_positive("noise_px", noise_px)
     elif redundancy <= 0:

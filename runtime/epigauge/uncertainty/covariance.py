@@ -15,7 +15,7 @@ from epigauge.bundle.similarity import Similarity
 from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.uncertainty.datum import Projection, projection
-from epigauge.uncertainty.gauge_free import GaugeFree
+from epigauge.uncertainty.gauge_free_lines import GaugeFreeLines
 from epigauge.uncertainty.inverse import Inverse, Part, spread
 from epigauge.uncertainty.sandwich import Sandwich
 
@@ -40,22 +40,25 @@ class Std(Result):
         Of the parameters of each camera, in their units; zero where they are not refined.
     points : ndarray, shape (m, 3)
         Of the points; infinite for one whose observations leave it open along its ray.
+    lines : ndarray, shape (L, 6), or None
+        Of the Pluecker coordinates of the lines; infinite for one that its segments leave open.
     """
 
     rotations: Array
     centres: Array
     intrinsics: Array
     points: Array
+    lines: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class MetricCovariance(GaugeFree, Result):
+class MetricCovariance(GaugeFreeLines, Result):
     """Covariances of a calibrated reconstruction in a datum.
 
     A view has six numbers: its small rotation about the axes of the scene (radians), and its
-    centre. `camera`, `intrinsics`, `point` and `between` give any block; each is computed when it
-    is asked for, and no matrix of all unknowns is formed. `distance`, `ratio`, `angle`,
-    `relative_pose` and projections are propagated from these.
+    centre. `camera`, `intrinsics`, `point`, `line` and `between` give any block; each is computed
+    when it is asked for, and no matrix of all unknowns is formed. `distance`, `ratio`, `angle`,
+    `relative_pose`, `line_distance`, `line_angle` and projections are propagated from these.
 
     Attributes
     ----------
@@ -82,6 +85,7 @@ class MetricCovariance(GaugeFree, Result):
     _inverse: Inverse | Sandwich
     _home: Similarity
     _rows: tuple[Array, Array]
+    _of_lines: Array | None = None
 
     def _contents(self) -> dict[str, Any]:
         known = {name: getattr(self, name) for name in ("noise_px", "redundancy", "open")}
@@ -93,6 +97,8 @@ class MetricCovariance(GaugeFree, Result):
         rows = {name: f"{known[name]}" for name in ("redundancy", "gauge", "open")}
         for name, unit in (("rotations", "rad"), ("centres", "units"), ("points", "units")):
             rows[f"std of {name}"] = f"{np.median(getattr(std, name)):.4g} {unit} in the median"
+        if std.lines is not None:
+            rows["std of lines"] = f"{np.median(std.lines[:, 3:]):.4g} of directions in the median"
         return {"noise_px": f"{self.noise_px:.6g}"} | rows
 
     def in_gauge(self, gauge: Any) -> MetricCovariance:
@@ -179,6 +185,11 @@ class MetricCovariance(GaugeFree, Result):
     @cached_property
     def _local_points(self) -> Array:
         """Blocks of points as computed with, (m, 3, 3), without the noise."""
+        return self._local_features[: self.reconstruction.n_points, :3, :3]
+
+    @cached_property
+    def _local_features(self) -> Array:
+        """Blocks of points, and of lines after them, as computed with, without the noise."""
         low = self._projection
         return spread(self._inverse.diagonals[1], low.points, low.M)
 
@@ -208,18 +219,58 @@ class MetricCovariance(GaugeFree, Result):
         """
         return self.between(("point", j), ("point", j))
 
+    def line(self, k: int) -> Array:
+        """Return the covariance of the Pluecker coordinates (n, v) of a line, v of length one.
+
+        Parameters
+        ----------
+        k : int
+            Line.
+
+        Returns
+        -------
+        ndarray, shape (6, 6)
+            Of rank four: n in the unit of the scene, about its origin.
+        """
+        return self.between(("line", k), ("line", k))
+
+    def line_update(self, k: int) -> Array:
+        """Return the covariance of the update of a line in its orthonormal representation.
+
+        It is written about the farthest centre of the cameras that see the line, and in units of
+        the distance from there: U <- U R(x), W <- W R(phi) of Bartoli & Sturm (CVIU 2005). A
+        similarity that takes scene and datum along leaves it as it is.
+
+        Parameters
+        ----------
+        k : int
+            Line.
+
+        Returns
+        -------
+        ndarray, shape (4, 4)
+            Of x in radians, and of phi: half the share by which the distance changes.
+        """
+        self._part("k", ("line", k))
+        part = (None, self.reconstruction.n_points + int(k))
+        low = self._projection
+        around = low.points[part[1]]
+        block = self._inverse.block(part, part) + around @ low.M @ around.T
+        return np.asarray(self.noise_px**2 * block)
+
     def between(self, a: tuple[str, int], b: tuple[str, int]) -> Array:
         """Return the covariance of any two parts.
 
         Parameters
         ----------
         a, b : tuple of str and int
-            Such as ``("camera", 3)``, ``("intrinsics", 0)``, ``("point", 17)``.
+            Such as ``("camera", 3)``, ``("intrinsics", 0)``, ``("point", 17)``, ``("line", 5)``.
 
         Returns
         -------
         ndarray
-            Six numbers a camera, three a point, one an adjustable parameter of intrinsics.
+            Six numbers a camera, three a point, six a line (its Pluecker coordinates), one an
+            adjustable parameter of intrinsics.
 
         Raises
         ------
@@ -258,10 +309,20 @@ class MetricCovariance(GaugeFree, Result):
         both = self._space[:, :, None] * self._space[:, None, :]
         turned = self._local_points.reshape(-1, 9) @ both.reshape(3, 9).T
         of_points = np.sqrt(np.maximum(self.noise_px**2 * turned, 0.0))
-        of_points[self._inverse.at_infinity] = np.inf
+        of_points[self._inverse.at_infinity[: len(of_points)]] = np.inf
         own = _roots(self._own_blocks)[first, _POSE:d]
         of_poses = self.noise_px * _roots(self._pose_blocks)
-        return Std(of_poses[:, :3], of_poses[:, 3:], self.noise_px * own, of_points)
+        return Std(of_poses[:, :3], of_poses[:, 3:], self.noise_px * own, of_points, self._lines)
+
+    @property
+    def _lines(self) -> Array | None:
+        """Standard deviations of Pluecker coordinates, (L, 6)."""
+        out, m = self._of_lines, self.reconstruction.n_points
+        if out is None:
+            return None
+        found = self.noise_px * _roots(out @ self._local_features[m:] @ np.swapaxes(out, 1, 2))
+        found[self._inverse.at_infinity[m:]] = np.inf
+        return found
 
     @cached_property
     def _poses(self) -> Array:
@@ -291,6 +352,8 @@ class MetricCovariance(GaugeFree, Result):
             "intrinsics": len(cameras),
             "point": self.reconstruction.n_points,
         }
+        if self._of_lines is not None:
+            counts["line"] = len(self._of_lines)
         try:
             kind, index = value
             count = counts[kind]
@@ -302,7 +365,12 @@ class MetricCovariance(GaugeFree, Result):
             raise ArgumentError(name, f"is {value!r:.60}", f"{kind} 0 to {count - 1}")
         index = int(index)
         if kind == "point":
-            return _Part((None, index), self._space)
+            # Beside lines the tangent of a point has an entry that moves nothing.
+            beside = 0 if self._of_lines is None else 1
+            return _Part((None, index), np.pad(self._space, ((0, 0), (0, beside))))
+        if kind == "line":
+            assert self._of_lines is not None
+            return _Part((None, self.reconstruction.n_points + index), self._of_lines[index])
         d = self._inverse.sizes[1]
         if kind == "camera":
             return _Part((index, None), np.pad(self._poses[index], ((0, 0), (0, d - _POSE))))

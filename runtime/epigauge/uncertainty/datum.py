@@ -38,7 +38,7 @@ class Projection:
 
     Attributes
     ----------
-    cameras, points : ndarray, shape (n, d, q), (m, 3, q)
+    cameras, points : ndarray, shape (n, d, q), (m, b, q)
         L.
     M : ndarray, shape (q, q)
         M.
@@ -59,7 +59,7 @@ def projection(
     datum : Datum or "inner"
         Where to.
     cameras, points : ndarray, shape (n, c), (m, 3)
-        The estimate.
+        The estimate; lines that `inverse` has beyond the points are part of no datum.
     inverse : Inverse or Sandwich
         X.
 
@@ -73,9 +73,14 @@ def projection(
     G = motions.along(motions.open)
     free = motions.open.shape[1]
     if not free:
-        none = np.zeros((*inverse.sizes[:2], 0)), np.zeros((len(points), 3, 0))
+        none = np.zeros((*inverse.sizes[:2], 0)), np.zeros((*motions.points.shape[:2], 0))
         return Projection(*none, np.zeros((0, 0)))
-    C = _conditions(datum, cameras, points, motions.cameras, motions.points)
+    of_cameras, own = _conditions(
+        datum, cameras, points, motions.cameras, motions.points[: len(points), :3]
+    )
+    of_points = np.zeros((*motions.points.shape[:2], own.shape[2]))
+    of_points[: len(points), :3] = own
+    C = of_cameras, of_points
     if _is_inner(datum):
         return _projection(*_orthonormal(C, motions.open, G, datum), inverse)
     return onto(_first(C, G, free) if C[0].shape[2] > free else C, inverse, datum)
@@ -86,7 +91,7 @@ def onto(C: tuple[Array, Array], inverse: Inverse | Sandwich, datum: Any) -> Pro
 
     Parameters
     ----------
-    C : tuple of ndarray, shape (n, d, f), (m, 3, f)
+    C : tuple of ndarray, shape (n, d, f), (m, b, f)
         As many conditions as there are free motions, as columns.
     inverse : Inverse or Sandwich
         X.
@@ -128,7 +133,7 @@ def _orthonormal(
     Of few points among others far away these are small and alike: the motions are combined so that
     they are orthonormal on the parts, by a decomposition that does not square their condition.
     """
-    n, m = len(C[0]), len(C[1])
+    n = len(C[0])
     parts = [combined(part, open_).reshape(-1, open_.shape[1]) for part in C]
     whole = np.concatenate(parts)
     size = np.linalg.norm(whole, axis=0)
@@ -140,7 +145,7 @@ def _orthonormal(
         raise _leaves_free(datum)
     back = np.linalg.inv(R) / size[:, None]
     count = len(parts[0])
-    K = Q[:count].reshape(n, -1, Q.shape[1]), Q[count:].reshape(m, 3, -1)
+    K = Q[:count].reshape(n, -1, Q.shape[1]), Q[count:].reshape(*C[1].shape[:2], -1)
     return K, (combined(G[0], back), combined(G[1], back))
 
 

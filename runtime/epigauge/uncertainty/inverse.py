@@ -58,7 +58,7 @@ class Motions:
 
     Attributes
     ----------
-    cameras, points : ndarray, shape (n, d, 7), (m, 3, 7)
+    cameras, points : ndarray, shape (n, d, 7), (m, b, 7)
         The generators, each of norm one.
     open : ndarray, shape (7, f)
         Those that nothing holds.
@@ -73,12 +73,19 @@ class Motions:
 
     @staticmethod
     def of(system: BundleSystem, priors: Priors | None, kernels: Table) -> Motions:
-        """Return the motions at an estimate.
+        """Return the motions of cameras and points at an estimate."""
+        moves = generators(system.model, kernels, system.cameras, system.points)
+        return Motions.along_gauge(system, priors, *moves)
+
+    @staticmethod
+    def along_gauge(
+        system: BundleSystem, priors: Priors | None, cameras: Array, points: Array
+    ) -> Motions:
+        """Return the motions, given the generators (n, d, 7) and (m, b, 7) of the gauge.
 
         What holds a motion is read off the ties and the priors' derivatives, however weak these
         are beside the images.
         """
-        cameras, points = generators(system.model, kernels, system.cameras, system.points)
         size = np.sqrt(np.sum(cameras**2, axis=(0, 1)) + np.sum(points**2, axis=(0, 1)))
         cameras, points = cameras / size, points / size
         count = cameras.shape[2]
@@ -102,7 +109,7 @@ class Motions:
         return np.column_stack([self.open, self.held])
 
     def along(self, chosen: Array) -> tuple[Array, Array]:
-        """Return motions (n, d, k) and (m, 3, k) of combinations (7, k)."""
+        """Return motions (n, d, k) and (m, b, k) of combinations (7, k)."""
         return combined(self.cameras, chosen), combined(self.points, chosen)
 
     def lifted(self, system: BundleSystem) -> Array:
@@ -201,7 +208,7 @@ class Inverse:
         system: BundleSystem,
         reference: NumpyLinearizer,
         priors: Priors | None,
-        kernels: Table,
+        motions: Motions,
     ) -> Inverse:
         """Invert the normal equations at an estimate.
 
@@ -210,7 +217,6 @@ class Inverse:
         ArgumentError
             Where the observations leave something undetermined beside the gauge.
         """
-        motions = Motions.of(system, priors, kernels)
         unit = np.sqrt(motions.weights(system)) * combined(motions.cameras, motions.loose)
         return Inverse.held(system, reference, motions, unit, motions.lifted(system), priors)
 

@@ -30,7 +30,7 @@ class Difference:
 
     Attributes
     ----------
-    cameras, points, edges : ndarray, shape (n, d, d), (m, 3, 3), (E, d, 3)
+    cameras, points, edges : ndarray, shape (n, d, d), (m, b, b), (E, d, b)
         The blocks.
     border : Border
         Columns of a term share * border border^T.
@@ -59,13 +59,13 @@ class Difference:
         cameras, points = (share * part for part in added_by_priors(system, priors))
         np.add.at(cameras, graph.view[wrong], np.swapaxes(A, 1, 2) @ C @ A)
         np.add.at(points, graph.point[wrong], np.swapaxes(B, 1, 2) @ C @ B)
-        each = np.zeros((len(graph.view), cameras.shape[1], 3))
+        each = np.zeros((len(graph.view), cameras.shape[1], points.shape[1]))
         each[wrong] = np.swapaxes(A, 1, 2) @ C @ B
         none = Border(np.zeros((*cameras.shape[:2], 0)), np.zeros((*points.shape[:2], 0)))
         return Difference(cameras, points, graph.sum_edges(each), system.constraints or none, share)
 
     def apply(self, inverse: Inverse, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return D times columns (n, d, k) and (m, 3, k)."""
+        """Return D times columns (n, d, k) and (m, b, k)."""
         graph = inverse.graph
         along = self.share * products(self.border, (x, y))
         cameras = self.cameras @ x + graph.sum_views(self.edges @ y[graph.point])
@@ -85,7 +85,7 @@ def pull(
     _, A, B = reference.observe(system.cameras, system.points)
     graph = reference.graph
     cameras = np.zeros((*system.normal.g_cameras.shape, 1))
-    points = np.zeros((graph.n_points, 3, 1))
+    points = np.zeros((graph.n_points, B.shape[1], 1))
     np.add.at(cameras[..., 0], graph.view[wrong], np.einsum("idk,ki->kd", A[..., wrong], psi))
     np.add.at(points[..., 0], graph.point[wrong], np.einsum("idk,ki->kd", B[..., wrong], psi))
     x, y = inverse.apply(cameras, points)
@@ -127,36 +127,36 @@ class Sandwich:
         return self.plain.sizes
 
     def apply(self, cameras: Array, points: Array) -> tuple[Array, Array]:
-        """Return this times columns (n, d, k) and (m, 3, k)."""
+        """Return this times columns (n, d, k) and (m, b, k)."""
         plain, bent = self._both(cameras, points)
         return self.kappa * plain[0] + bent[0], self.kappa * plain[1] + bent[1]
 
     def block(self, first: Part, second: Part) -> Array:
         """Return the block of two parts."""
-        n, d, m = self.sizes
+        (n, d, m), b = self.sizes, self.plain.T.shape[1]
         view, point = second
-        width = d if point is None else 3
-        columns = np.zeros((n, d, width)), np.zeros((m, 3, width))
+        width = d if point is None else b
+        columns = np.zeros((n, d, width)), np.zeros((m, b, width))
         if point is None:
             columns[0][view] = np.eye(d)
         else:
-            columns[1][point] = np.eye(3)
+            columns[1][point] = np.eye(b)
         x, y = self.apply(*columns)
         return np.asarray(x[first[0]] if first[1] is None else y[first[1]])
 
     @cached_property
     def diagonals(self) -> tuple[Array, Array]:
-        """The diagonal blocks of cameras (n, d, d) and points (m, 3, 3).
+        """The diagonal blocks of cameras (n, d, d) and points (m, b, b).
 
         Column by column of the cameras: two products with X a view.
         """
         plain, rest, graph = self.plain, self.rest, self.plain.graph
-        n, d, m = self.sizes
-        own, across = np.empty((n, d, d)), np.empty((2, len(graph.view), d, 3))
+        (n, d, m), b = self.sizes, plain.T.shape[1]
+        own, across = np.empty((n, d, d)), np.empty((2, len(graph.view), d, b))
         for i in range(n):
             columns = np.zeros((n, d, d))
             columns[i] = np.eye(d)
-            (x, y), (u, v) = self._both(columns, np.zeros((m, 3, d)))
+            (x, y), (u, v) = self._both(columns, np.zeros((m, b, d)))
             own[i] = self.kappa * x[i] + u[i]
             rows = np.flatnonzero(graph.view == i)
             across[:, rows] = np.swapaxes([y[graph.point[rows]], v[graph.point[rows]]], 2, 3)
