@@ -97,6 +97,12 @@ class DatabaseVerification(Result):
         Pairs that were verified before, and were left alone.
     backup : str or None
         Name of the copy that was made before.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> result = eg.colmap.verify_database("database.db")  # doctest: +SKIP
+    >>> [eg.colmap.CONFIGS[config] for config in result.config]  # doctest: +SKIP
     """
 
     names: dict[int, str] = field(repr=False)

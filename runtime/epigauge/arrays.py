@@ -27,6 +27,12 @@ class ArrayTable:
     ----------
     xp : module
         A namespace of the array API standard.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> import torch  # doctest: +SKIP
+    >>> eg.arrays.table(torch)  # doctest: +SKIP
     """
 
     def __init__(self, xp: Any) -> None:

@@ -120,6 +120,12 @@ class DatabaseResult(Result):
         Whether F was stored in the database.
     backup : str or None
         Name of the copy that was made before.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> result = eg.colmap.refine_database("database.db")  # doctest: +SKIP
+    >>> result.verdict, result.rms_px  # doctest: +SKIP
     """
 
     names: dict[int, str] = field(repr=False)

@@ -138,6 +138,13 @@ def from_opencv(
     ------
     ArgumentError
         If a match has no such keypoint.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> x1, x2 = eg.interop.from_opencv(*eg.interop.to_opencv([[10.0, 20.0]], [[11.0, 20.5]]))
+    >>> x1.tolist(), x2.tolist()
+    ([[10.0, 20.0]], [[11.0, 20.5]])
     """
     indices = [(match.queryIdx, match.trainIdx) for match in matches]
     points1, points2 = (np.array([k.pt for k in found]) for found in (keypoints1, keypoints2))
@@ -167,6 +174,13 @@ def to_opencv(
     ------
     MissingPackageError
         If OpenCV is not installed.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> keypoints1, keypoints2, found = eg.interop.to_opencv([[10.0, 20.0]], [[11.0, 20.5]])
+    >>> keypoints2[found[0].trainIdx].pt
+    (11.0, 20.5)
     """
     cv2 = _package("cv2", "opencv-python-headless")
     x1, x2 = as_matches(x1, x2, at_least=0)
@@ -194,6 +208,13 @@ def from_colmap(keypoints1: Any, keypoints2: Any, matches: Any) -> tuple[Array, 
     ------
     ArgumentError
         If a match has no such keypoint, or the shapes are others.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> x1, x2 = eg.interop.from_colmap([[10.0, 20.0], [5.0, 6.0]], [[11.0, 20.5]], [[1, 0]])
+    >>> x1.tolist(), x2.tolist()
+    ([[5.0, 6.0]], [[11.0, 20.5]])
     """
     if hasattr(_first(matches), "point2D_idx1"):
         matches = [(match.point2D_idx1, match.point2D_idx2) for match in matches]
@@ -224,6 +245,13 @@ def to_colmap(
         A keypoint a match.
     matches : ndarray of uint32, shape (m, 2)
         Match k joins keypoints k.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> keypoints1, keypoints2, found = eg.interop.to_colmap([[10.0, 20.0]], [[11.0, 20.5]])
+    >>> keypoints2.tolist(), found.tolist()
+    ([[11.0, 20.5]], [[0, 0]])
     """
     x1, x2 = as_matches(x1, x2, at_least=0)
     indices = np.arange(len(x1), dtype=np.uint32)
@@ -249,6 +277,15 @@ def from_two_view_geometry(geometry: Any) -> tuple[Array, NDArray[np.uint32]]:
     ------
     ArgumentError
         If it holds no F, as a homography does not.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> scene = eg.two_view_scene(seed=1)
+    >>> geometry = eg.interop.to_two_view_geometry(scene.F_true, [[0, 0], [1, 2]])
+    >>> F, rows = eg.interop.from_two_view_geometry(geometry)
+    >>> bool(np.isclose(abs(np.sum(F * scene.F_true)), 1.0)), rows.tolist()
+    (True, [[0, 0], [1, 2]])
     """
     if geometry.F is None or not np.any(geometry.F):
         raise ArgumentError("geometry", "holds no F", "one with a fundamental matrix")
@@ -274,6 +311,14 @@ def to_two_view_geometry(F: ArrayLike, inlier_matches: ArrayLike) -> Any:
     ------
     MissingPackageError
         If pycolmap is not installed.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.two_view_scene(seed=1)
+    >>> geometry = eg.interop.to_two_view_geometry(scene.F_true, [[0, 0], [1, 2]])
+    >>> len(geometry.inlier_matches)
+    2
     """
     pycolmap = _package("pycolmap", "pycolmap")
     geometry = pycolmap.TwoViewGeometry()
@@ -302,6 +347,14 @@ def from_poselib(pair: Any) -> tuple[Array, Array, Array]:
     ------
     ArgumentError
         If a camera has distortion, or the cameras did not move apart.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> K = np.diag([800.0, 800.0, 1.0])
+    >>> F, K1, K2 = eg.interop.from_poselib(eg.interop.to_poselib(np.eye(3), [1.0, 0.0, 0.0], K, K))
+    >>> bool(np.allclose(K1, K)), F.shape
+    (True, (3, 3))
     """
     K1, K2 = _calibration("camera1", pair.camera1), _calibration("camera2", pair.camera2)
     if not np.any(pair.pose.t):
@@ -339,6 +392,14 @@ def to_poselib(
         If R is no rotation, or K1 or K2 is no calibration matrix without skew.
     MissingPackageError
         If PoseLib is not installed.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> K = np.diag([800.0, 800.0, 1.0])
+    >>> pair = eg.interop.to_poselib(np.eye(3), [1.0, 0.0, 0.0], K, K)
+    >>> type(pair).__name__
+    'ImagePair'
     """
     poselib = _package("poselib", "poselib")
     rotation = as_real("R", R, "a rotation (3, 3)")

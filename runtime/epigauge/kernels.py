@@ -47,6 +47,13 @@ class Table:
     ----------
     name : {"c", "numpy", "casadi"}
         The backend.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> table = eg.kernels.Table("numpy")
+    >>> table.name
+    'numpy'
     """
 
     def __init__(self, name: str) -> None:

@@ -31,6 +31,13 @@ class LineScene:
         Measured segments: each view sees another part of a line.
     true : MetricReconstruction
         True cameras, points and lines, in metres.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.line_scene(n_views=4, n_lines=10)
+    >>> scene.line_tracks.n_lines, scene.tracks.n_views
+    (10, 4)
     """
 
     tracks: Tracks

@@ -36,6 +36,13 @@ class TwoViewScene:
         Calibration of both cameras.
     X : ndarray, shape (m, 4)
         Points (x, y, z, 1) in metres; the centre of the cube is the origin.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.two_view_scene(n_points=30)
+    >>> scene.x1.shape, scene.F_true.shape, float(scene.K[0, 0])
+    ((30, 2), (3, 3), 1000.0)
     """
 
     x1: Array
@@ -173,6 +180,13 @@ class MultiViewScene:
         centre of the cube is the origin.
     xy_true : ndarray, shape (N, 2)
         The measured points without noise, in the order of the tracks.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.multi_view_scene(n_points=30)
+    >>> scene.tracks.n_points, scene.true.P.shape
+    (30, (5, 3, 4))
     """
 
     tracks: Tracks

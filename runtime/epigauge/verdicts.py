@@ -35,6 +35,12 @@ class Flag:
         What to do about it.
     spoils : tuple of str
         Kinds of result that must not be used then: "F", "E", "H", "views".
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.verdicts.FLAGS["still camera"].spoils
+    ('F', 'E', 'views')
     """
 
     sentence: str

@@ -97,6 +97,12 @@ class IntrinsicPrior:
         Name of the parameter, as ``"f"``.
     value, sigma : float
         Value and standard deviation, in the parameter's unit.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.IntrinsicPrior(0, "f", 812.0, 4.0).name
+    'f'
     """
 
     camera: int
@@ -119,6 +125,12 @@ class PointPrior:
         Standard deviations of the three coordinates.
     covariance : array_like, shape (3, 3), optional
         In place of `sigma`.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.PointPrior(3, (10.0, 20.0, 1.5), sigma=0.01).point
+    3
     """
 
     point: int

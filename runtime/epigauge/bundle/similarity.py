@@ -27,6 +27,13 @@ class Similarity:
         A rotation.
     origin, target : ndarray, shape (3,)
         The point that moves, and where it moves to.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> move = eg.gauge.Similarity(2.0, np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    >>> move.positions(np.array([[1.0, 2.0, 3.0]])).tolist()
+    [[2.0, 4.0, 7.0]]
     """
 
     scale: float

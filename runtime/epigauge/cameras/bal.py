@@ -107,6 +107,12 @@ def colmap_to_bal(
     ------
     ArgumentError
         If the cameras are others: BAL's have one focal length and two radial coefficients.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> tracks, scene = eg.load_scene("sparse/0")  # doctest: +SKIP
+    >>> eg.save_scene("problem.txt.bz2", *eg.interop.colmap_to_bal(tracks, scene))  # doctest: +SKIP
     """
     cameras = reconstruction.cameras
     if cameras.model not in _RADIAL:

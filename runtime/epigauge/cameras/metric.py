@@ -49,6 +49,14 @@ class MetricReconstruction(ReconstructionBase):
     ArgumentError
         On other shapes, numbers that are not finite, lines at infinity, matrices R that are no
         rotations (the message says how to repair them), and cameras that have no rotation.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> cameras = eg.Cameras("SIMPLE_PINHOLE", [[800.0, 320.0, 240.0]], [0])
+    >>> scene = eg.MetricReconstruction(np.eye(3)[None], [[0, 0, 0]], [[0, 0, 4.0]], cameras)
+    >>> scene.centres.tolist(), scene.P.shape
+    ([[0.0, 0.0, 0.0]], (1, 3, 4))
     """
 
     R: Array

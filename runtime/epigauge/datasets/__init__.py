@@ -146,6 +146,11 @@ def images(name: str, *, base_url: str = PUBLIC) -> tuple[Path, ...]:
     ------
     ArgumentError, DatasetError, MissingPackageError
         As for `path`.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> [path.name for path in eg.datasets.images("house")]  # doctest: +SKIP
     """
     entry = describe(name)
     return tuple(
@@ -219,6 +224,11 @@ def arrays(name: str, *, base_url: str = PUBLIC) -> dict[str, NDArray[Any]]:
     ------
     ArgumentError, DatasetError, MissingPackageError
         As for `path`.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.datasets.arrays("house")["P"].shape  # doctest: +SKIP
     """
     file = path(name, base_url=base_url)
     if file.suffix == ".npz":

@@ -29,6 +29,12 @@ class Source:
         Path of the file in it.
     sha256 : str
         Of its bytes.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.datasets.Source("owner/name", "0" * 40, "data/a.npz", "0" * 64).path
+    'data/a.npz'
     """
 
     repository: str
@@ -80,6 +86,13 @@ class Dataset:
         (width, height) of the images, in pixels, where a download would not tell.
     convert : str
         How the sources become the file: a function of the module ``_convert``.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> entry = eg.datasets.describe("house")
+    >>> entry.kind, entry.downloadable
+    ('tracks', True)
     """
 
     name: str

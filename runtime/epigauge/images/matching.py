@@ -51,6 +51,13 @@ class ImageMatches(Matches):
         What found the features.
     n_features1, n_features2 : int
         How many it found in each image.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> found = eg.match_images(eg.samples.path("A.jpg"), eg.samples.path("B.jpg"))
+    >>> found.name, found.detector, found.image_size1
+    ('A - B', 'sift', (640, 480))
     """
 
     detector: str = "sift"

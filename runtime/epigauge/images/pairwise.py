@@ -49,6 +49,15 @@ class PairwiseMatches:
         For images i < j rows of features in i and j that match. Wrong ones may be among them.
     colours : tuple of ndarray of uint8, shape (k, 3), optional
         Red, green, blue of each feature.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> found = eg.PairwiseMatches(
+    ...     ("a", "b"), np.array([[640, 480]] * 2), (np.zeros((3, 2)), np.ones((3, 2))),
+    ...     {(0, 1): np.array([[0, 2], [1, 0]])})
+    >>> len(found.pairs[0, 1])
+    2
     """
 
     names: tuple[str, ...]

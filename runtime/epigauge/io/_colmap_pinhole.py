@@ -56,6 +56,14 @@ def save_colmap_model(
         a binary model.
     OSError
         If the files cannot be written.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> from epigauge.multi_view.pinhole import pinhole_model
+    >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+    >>> model = pinhole_model(eg.bundle_adjust(tracks).reconstruction, tracks)
+    >>> eg.io.save_colmap_model("sparse/0", model, tracks)  # doctest: +SKIP
     """
     if names is None:
         names = [f"view{k:04d}" for k in range(tracks.n_views)]

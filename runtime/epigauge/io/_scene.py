@@ -43,6 +43,12 @@ class SceneSource:
         The rotations as the file has them: quaternions or Rodrigues vectors.
     colmap : ColmapSource, optional
         Numbers and whatever else a COLMAP model holds.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> eg.io.SceneSource(notes=("a view has no points",)).notes
+    ('a view has no points',)
     """
 
     notes: tuple[str, ...] = ()
@@ -66,6 +72,13 @@ class ColmapSource:
         Which of `camera_ids` took each view.
     cameras, rigs, frames : tuple
         As in the files, those that no view uses too; no rigs and frames before COLMAP 3.12.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> none = np.zeros(0, dtype=np.intp)
+    >>> eg.io.ColmapSource(none, none, none, (), none, none).rigs is None
+    True
     """
 
     image_ids: Indices

@@ -106,7 +106,7 @@ def plain(value: Any) -> Any:
         return float(value) if math.isfinite(value) else None
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
-    if isinstance(value, list | tuple):
+    if isinstance(value, list | tuple) and not isinstance(value, Result):
         return [plain(item) for item in value]
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
@@ -143,6 +143,17 @@ def writing(path: PathLike) -> Iterator[IO[bytes]]:
     ------
     OSError
         If the file cannot be written, or exists and is not a regular file.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> import tempfile, pathlib
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = pathlib.Path(folder, "a.txt")
+    ...     with eg.io.writing(path) as file:
+    ...         _ = file.write(b"whole")
+    ...     print(path.read_text())
+    whole
     """
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():

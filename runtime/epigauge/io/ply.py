@@ -48,6 +48,16 @@ def save_ply(
         If the suffix is another one.
     OSError
         If the file cannot be written.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> import tempfile, pathlib
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = pathlib.Path(folder, "cloud.ply")
+    ...     eg.io.save_ply(path, np.zeros((2, 3)), np.zeros((2, 3), np.uint8), "two points")
+    ...     print(path.read_bytes()[:3].decode())
+    ply
     """
     check_suffix(path, ".ply")
     vertices = np.empty(len(xyz), dtype=_VERTEX)

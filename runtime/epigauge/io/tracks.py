@@ -53,6 +53,13 @@ class TrackFile:
         Cameras and points, where the file has both.
     views, points : ndarray of int
         The numbers in the file of the views and points of the tracks.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> file = eg.io.load_track_file(eg.samples.path("tracks.csv"))
+    >>> file.tracks.n_views, file.start is None, file.views.tolist()
+    (5, True, [0, 1, 2, 3, 4])
     """
 
     tracks: Tracks
@@ -157,6 +164,13 @@ def load_track_file(
     ------
     FileFormatError, OSError
         As for `load_tracks`.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> file = eg.io.load_track_file(eg.samples.path("tracks.csv"))
+    >>> file.tracks.n_points, file.points.shape
+    (100, (100,))
     """
     path = Path(path)
     found = _read(path, with_start, image_size)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
 from epigauge._arguments import as_fundamental, as_positive, as_real
+from epigauge._results import Result
 from epigauge.errors import ArgumentError
 
 __all__ = ["FocalLengths", "focal_lengths"]
@@ -23,7 +24,13 @@ WEAK, OPEN = 0.05, 0.3
 _FARTHEST = 1e9
 
 
-class FocalLengths(NamedTuple):
+class _Focal(NamedTuple):
+    focal_px: tuple[float, float]
+    std_px: tuple[float, float]
+    flag: str
+
+
+class FocalLengths(_Focal, Result):
     """Focal lengths of two views.
 
     Attributes
@@ -35,11 +42,19 @@ class FocalLengths(NamedTuple):
     flag : str
         Empty; "weak focal length" beyond 5 %; or "undetermined" beyond 30 %, or where F has no real
         focal lengths: the optical axes meet or are parallel, or nearly so.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> found = eg.FocalLengths((812.0, 809.5), (9.1, 9.3), "")
+    >>> found.focal_px[0], found.flag
+    (812.0, '')
     """
 
-    focal_px: tuple[float, float]
-    std_px: tuple[float, float]
-    flag: str
+    __slots__ = ()
+
+    def _contents(self) -> dict[str, Any]:
+        return self._asdict()
 
 
 def focal_lengths(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
 from epigauge._arguments import as_array, as_count, as_real
+from epigauge._results import Result
 from epigauge.cameras import MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.metric.deviation import focal_lengths_of, known_to, turn_std
@@ -41,7 +42,7 @@ _ROUNDS, _SETTLED = 4, 1e-3
 
 
 @dataclass(frozen=True)
-class MetricUpgrade:
+class MetricUpgrade(Result):
     """A metric scene from tracks alone, and what is known of its cameras.
 
     Attributes
@@ -76,6 +77,14 @@ class MetricUpgrade:
         The last adjustment.
     covariance : MetricCovariance or None
         Of everything, by the noise of independent observations alone: `focal_std_px` is wider.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+    >>> result = eg.metric_upgrade(tracks, image_size=(512, 512))
+    >>> result.success, result.reconstruction.cameras.model, "weak focal length" in result.flags
+    (True, 'SIMPLE_RADIAL', True)
     """
 
     reconstruction: MetricReconstruction | None = field(repr=False)
@@ -91,6 +100,16 @@ class MetricUpgrade:
     candidates: tuple[Candidate, ...] = field(repr=False)
     bundle: BundleResult | None = field(repr=False)
     covariance: MetricCovariance | None = field(repr=False)
+
+    def _contents(self) -> dict[str, Any]:
+        """Return what is known; `bundle` would tell the scene twice, and has a form of its own."""
+        own = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in own.items() if name != "bundle"}
+
+    def _arrays(self) -> dict[str, Any]:
+        """Return what arrays can hold."""
+        left = "candidates", "covariance"
+        return {name: value for name, value in self._contents().items() if name not in left}
 
     def kept(self, tracks: Tracks) -> tuple[Tracks, MetricReconstruction]:
         """Return the observations that were not set aside, and the scene of what they show.

@@ -59,6 +59,14 @@ class Comparison(Result):
         One a method, in the order asked for.
     start_rms_px : float
         RMS of the common start.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+    >>> result = eg.compare(tracks, ["covariant", "free"])
+    >>> [(row.method, row.success) for row in result.rows]
+    [('covariant', True), ('free', True)]
     """
 
     rows: tuple[ComparedMethod, ...]

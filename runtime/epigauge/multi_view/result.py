@@ -81,6 +81,14 @@ class BundleResult(Result):
     Flags, rank, n_behind, condition, weakest, message and success are computed when the first of
     them is asked for: the verdict on a few hundred points takes as long as their adjustment. Until
     then the result holds the normal equations; with several workers it is judged at once.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+    >>> result = eg.bundle_adjust(tracks)
+    >>> result.success, result.reconstruction.P.shape, round(result.rms_px, 3)
+    (True, (5, 3, 4), 0.796)
     """
 
     _shown: ClassVar[tuple[str, ...]] = (

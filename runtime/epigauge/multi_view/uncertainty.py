@@ -69,6 +69,15 @@ class ReconstructionCovariance(Result):
         covariance in any gauge, brought to this basis and these scales, to the one here. In
         `two_cameras` near sigma = 1, where the scale of H* has a kink, this leaves out what moves
         along the scale without being correlated with anything.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+    >>> result = eg.bundle_adjust(tracks)
+    >>> covariance = eg.covariance(tracks, result.reconstruction)
+    >>> covariance.cameras.shape, round(covariance.noise_px, 2)
+    ((5, 12, 12), 0.98)
     """
 
     reconstruction: Reconstruction

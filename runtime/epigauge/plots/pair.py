@@ -82,6 +82,13 @@ def plot_pair(
         If an image cannot be read.
     MissingPackageError
         If Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> matches = eg.match_images("A.jpg", "B.jpg")  # doctest: +SKIP
+    >>> result = eg.estimate_fundamental(matches.x1, matches.x2)  # doctest: +SKIP
+    >>> eg.plots.plot_pair(result, matches, ("A.jpg", "B.jpg"))  # doctest: +SKIP
     """
     photos = photographs(matches, images)
     if result.inlier.shape != (len(matches),):

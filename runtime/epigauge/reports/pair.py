@@ -68,6 +68,14 @@ def save_pair_report(
         If an image cannot be read, or the file not be written.
     MissingPackageError
         If Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> matches = eg.match_images("A.jpg", "B.jpg")  # doctest: +SKIP
+    >>> result = eg.estimate_fundamental(matches.x1, matches.x2)  # doctest: +SKIP
+    >>> images = "A.jpg", "B.jpg"
+    >>> eg.reports.save_pair_report("pair.html", result, matches, images)  # doctest: +SKIP
     """
     check_suffix(path, ".html")
     photos = photographs(matches, images)

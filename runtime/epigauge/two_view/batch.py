@@ -63,6 +63,14 @@ class FundamentalBatch(Partial):
     flags : tuple of tuple of str
         What each pair's matches do not support, as `FundamentalResult.flags`; empty for refused
         pairs. Computed when asked for.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> matches = eg.load_matches(eg.samples.path("matches.csv"))
+    >>> result = eg.refine_fundamental_batch(matches.x1, matches.x2, [0, len(matches)])
+    >>> result.F.shape, result.success.tolist(), result.reasons
+    ((1, 3, 3), [True], {})
     """
 
     F: Array

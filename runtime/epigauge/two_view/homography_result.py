@@ -75,6 +75,16 @@ class HomographyResult(Result):
     References
     ----------
     .. [1] P. J. Huber, "Robust Statistics", 1981, section 7.6.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> x1 = rng.uniform(0, 500, (60, 2))
+    >>> x2 = x1 @ [[1.1, 0.2], [-0.1, 0.9]] + [30, 5] + rng.normal(size=(60, 2))
+    >>> result = eg.refine_homography(x1, x2)
+    >>> result.rank, result.H.shape, bool(0.5 < result.noise_px < 2)
+    (8, (3, 3), True)
     """
 
     _shown: ClassVar[tuple[str, ...]] = (

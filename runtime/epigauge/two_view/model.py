@@ -79,6 +79,14 @@ class TwoViewResult(Result):
         Whether there is a model, and its fit may be used.
     message : str
         The same in words.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> raw = eg.load_matches(eg.samples.path("raw_matches.csv"))
+    >>> result = eg.estimate_two_view(raw.x1, raw.x2)
+    >>> result.model, result.success, result.R is None
+    ('F', True, True)
     """
 
     _shown: ClassVar[tuple[str, ...]] = ("model", "F", "E", "H", "R", "t", "message")

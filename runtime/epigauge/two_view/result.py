@@ -105,6 +105,14 @@ class FundamentalResult(Partial):
         With ``essential=True``: how many of the points that count (of positive weight; with a
         robust loss, within three standard deviations) lie in front of both cameras, or no farther
         from that than three standard deviations, as points nearly at infinity do.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> matches = eg.load_matches(eg.samples.path("matches.csv"))
+    >>> result = eg.refine_fundamental(matches.x1, matches.x2)
+    >>> result.success, result.rank, result.F.shape, round(result.rms_px, 2)
+    (True, 7, (3, 3), 0.66)
     """
 
     _shown: ClassVar[tuple[str, ...]] = (

@@ -61,6 +61,15 @@ class RobustResult(FundamentalResult):
     start : str
         Front end that gave the start: "native", "poselib", "opencv", or "8point" where it found
         nothing.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> raw = eg.load_matches(eg.samples.path("raw_matches.csv"))
+    >>> result = eg.estimate_fundamental(raw.x1, raw.x2)
+    >>> F, mask = result
+    >>> result.success, F.shape, bool(mask.mean() > 0.8)
+    (True, (3, 3), True)
     """
 
     _shown: ClassVar[tuple[str, ...]] = (

@@ -55,6 +55,14 @@ class RobustBatch(FundamentalBatch):
         As given: pair k has the matches ``offsets[k]:offsets[k + 1]``.
     distances : ndarray, shape (m,)
         Signed distances of all matches, wrong ones too.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> raw = eg.load_matches(eg.samples.path("raw_matches.csv"))
+    >>> result = eg.estimate_fundamental_batch(raw.x1, raw.x2, [0, len(raw)])
+    >>> result.F.shape, result.success.tolist(), result.inlier.shape == (len(raw),)
+    ((1, 3, 3), [True], True)
     """
 
     inlier: NDArray[np.bool_] = field(repr=False)

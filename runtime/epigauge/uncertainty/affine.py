@@ -71,6 +71,19 @@ class AffineCovariance(Result):
     open : int
         How many of the twelve motions of the gauge the datum has to hold; fixed views and points
         hold the rest.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> affine = eg.AffineReconstruction(rng.normal(size=(4, 2, 4)), rng.normal(size=(20, 3)))
+    >>> view, point = np.divmod(np.arange(80), 20)
+    >>> X = np.column_stack([affine.X, np.ones(20)])[point]
+    >>> xy = np.einsum("nij,nj->ni", affine.P[view][:, :2], X) + rng.normal(0, 0.1, (80, 2))
+    >>> tracks = eg.Tracks(view, point, xy)
+    >>> spread = eg.covariance(tracks, affine)
+    >>> spread.camera(0).shape, spread.point(3).shape
+    ((8, 8), (3, 3))
     """
 
     reconstruction: AffineReconstruction

@@ -75,6 +75,15 @@ class MetricCovariance(GaugeFreeLines, Result):
     open : int
         How many of the seven motions of the gauge the datum has to hold; priors and fixed views or
         points hold the rest.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> scene = eg.line_scene(n_views=4, n_lines=2)
+    >>> result = eg.bundle_adjust(scene.tracks, scene.true, refine="pose")
+    >>> spread = eg.covariance(scene.tracks, result.reconstruction, refine="pose")
+    >>> spread.camera(0).shape, spread.point(3).shape
+    ((6, 6), (3, 3))
     """
 
     reconstruction: MetricReconstruction

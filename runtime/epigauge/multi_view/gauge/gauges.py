@@ -28,7 +28,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class identity:
-    """The gauge the reconstruction is in."""
+    """The gauge the reconstruction is in.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+    >>> found = eg.bundle_adjust(tracks).reconstruction
+    >>> P, Q = eg.gauge.identity().transformation(found.P, found.Q).apply(found.P, found.Q)
+    >>> bool(np.allclose(P, found.P))
+    True
+    """
 
     def transformation(self, P: Array, Q: Array) -> Transformation:
         """Return the transformation that moves nothing."""
@@ -50,6 +60,15 @@ class reference_camera:
     ----------
     camera : int
         Number of the reference camera.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+    >>> found = eg.bundle_adjust(tracks).reconstruction
+    >>> P, Q = eg.gauge.reference_camera(2).transformation(found.P, found.Q).apply(found.P, found.Q)
+    >>> bool(np.allclose(P[2], np.eye(3, 4)))
+    True
     """
 
     camera: int = 0
@@ -81,6 +100,15 @@ class two_cameras:
     ----------
     first, second : int
         Numbers of the reference cameras.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+    >>> found = eg.bundle_adjust(tracks).reconstruction
+    >>> P, Q = eg.gauge.two_cameras(0, 4).transformation(found.P, found.Q).apply(found.P, found.Q)
+    >>> bool(np.allclose(P[0], np.eye(3, 4)))
+    True
     """
 
     first: int = 0
@@ -116,6 +144,15 @@ class five_points:
     ----------
     points : sequence of int, optional
         Numbers of the five; by default those found by `choose`, the best conditioned.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+    >>> found = eg.bundle_adjust(tracks).reconstruction
+    >>> P, Q = eg.gauge.five_points().transformation(found.P, found.Q).apply(found.P, found.Q)
+    >>> bool(np.allclose(np.linalg.norm(Q, axis=1), 1.0))
+    True
     """
 
     points: Sequence[int] | None = None
@@ -204,6 +241,15 @@ class normalized:
     """Unit-norm cameras and points with sum Q Q^T = (m / 4) I: the best conditioned basis.
 
     The fixed point of Tyler's scatter iteration; an orthonormal change of basis is left open.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+    >>> found = eg.bundle_adjust(tracks).reconstruction
+    >>> P, Q = eg.gauge.normalized().transformation(found.P, found.Q).apply(found.P, found.Q)
+    >>> bool(np.allclose(np.linalg.norm(Q, axis=1), 1.0))
+    True
     """
 
     def transformation(self, P: Array, Q: Array) -> Transformation:

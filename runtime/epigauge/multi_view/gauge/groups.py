@@ -28,6 +28,13 @@ class Group:
         Of the group, beside the scales of homogeneous cameras and points.
     names : tuple of str
         What its generators are.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> found = eg.gauge.group("PINHOLE")
+    >>> found.dimension, found.names[-1]
+    (7, 'scale')
     """
 
     model: str

@@ -31,6 +31,16 @@ class Transformation:
         Invertible.
     camera_scales, point_scales : ndarray, shape (n,), (m,)
         gamma and alpha, none zero.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+    >>> found = eg.bundle_adjust(tracks).reconstruction
+    >>> change = eg.gauge.normalized().transformation(found.P, found.Q)
+    >>> P, Q = change.apply(found.P, found.Q)
+    >>> bool(np.allclose(Q.T @ Q, len(Q) / 4 * np.eye(4)))
+    True
     """
 
     T: Array
@@ -82,7 +92,17 @@ class Transformation:
 
 
 class Gauge(Protocol):
-    """A rule that chooses basis and scales."""
+    """A rule that chooses basis and scales.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+    >>> found = eg.bundle_adjust(tracks).reconstruction
+    >>> rule: eg.gauge.Gauge = eg.gauge.two_cameras()
+    >>> rule.transformation(found.P, found.Q).T.shape
+    (4, 4)
+    """
 
     def transformation(self, P: Array, Q: Array) -> Transformation:
         """Return what moves cameras and points into the gauge.
@@ -184,6 +204,15 @@ def transform(
     ------
     ArgumentError
         If T is singular, a scale is zero, or T is of the other kind.
+
+    Examples
+    --------
+    >>> import epigauge as eg, numpy as np
+    >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+    >>> found = eg.bundle_adjust(tracks).reconstruction
+    >>> moved = eg.gauge.transform(found, np.diag([1.0, 2.0, 3.0, 1.0]))
+    >>> bool(np.isclose(moved.rms_px(tracks), found.rms_px(tracks)))
+    True
     """
     if isinstance(reconstruction, MetricReconstruction) or isinstance(T, Similarity):
         kinds = isinstance(reconstruction, MetricReconstruction), isinstance(T, Similarity)
