@@ -5,11 +5,14 @@ from __future__ import annotations
 import dataclasses
 import html
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from epigauge import verdicts
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["SCHEMA", "Result", "SavedResult"]
 
@@ -107,6 +110,39 @@ class Result:
         from epigauge.io.output import save_result
 
         save_result(path, self, **more)
+
+    def plot(self, *data: Any, **options: Any) -> Figure:
+        """Draw it.
+
+        Parameters
+        ----------
+        *data
+            What it was computed from: the matches ``x1, x2`` of results of two views, the tracks of
+            reconstructions, upgrades and metric covariances; nothing for all others.
+        **options
+            Of the picture of this kind of result.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            The picture; `epigauge.plots.save_figure` writes it.
+
+        Raises
+        ------
+        ArgumentError
+            If there is nothing to draw, or the data does not belong to the result.
+        MissingPackageError
+            If Matplotlib is not installed.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+        >>> figure = tracks.plot()  # doctest: +SKIP
+        """
+        from epigauge.plots import plot_result
+
+        return plot_result(self, *data, **options)
 
     def __str__(self) -> str:
         return self.summary()

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from epigauge import kernels
 from epigauge._results import Result, SavedResult
+from epigauge.errors import ArgumentError
 from metric_scenes import metric_scene
 
 VIEW = eg.two_view_scene(noise_px=0.5, seed=7)
@@ -224,6 +225,38 @@ def test_pictures_are_drawn_by_the_results() -> None:
     assert MADE["fundamental"]().plot(VIEW.x1, VIEW.x2).axes
     assert BUNDLE.plot(TRACKS, "scene").axes
     assert MADE["comparison"]().plot().axes
+
+
+#: What the pictures of some results show beside them.
+DATA: dict[str, tuple[Any, ...]] = {
+    **dict.fromkeys(("fundamental", "python loop", "essential"), (VIEW.x1, VIEW.x2)),
+    "homography": (VIEW.x1, 1.1 * VIEW.x1 + NOISE),
+    "model": (VIEW.x1, VIEW.x2),
+    "bundle": (TRACKS,),
+    "reconstruction": (TRACKS,),
+    "metric bundle": (CALIBRATED[0],),
+    "metric covariance": (CALIBRATED[0],),
+    "metric reconstruction": (CALIBRATED[0],),
+    "metric upgrade": (eg.load_tracks(eg.samples.path("tracks.csv")),),
+}
+
+
+@pytest.mark.parametrize("name", [n for n in MADE if n not in (*SLOW, "no metric upgrade")])
+def test_every_kind_of_result_has_a_picture(name: str) -> None:
+    pytest.importorskip("matplotlib", reason="pictures need Matplotlib")
+    figure = MADE[name]().plot(*DATA.get(name, ()))
+    figure.draw_without_rendering()
+    assert any(axes.has_data() for axes in figure.axes)
+
+
+def test_what_has_no_picture_says_so() -> None:
+    pytest.importorskip("matplotlib", reason="pictures need Matplotlib")
+    with pytest.raises(ArgumentError, match="has no scene"):
+        MADE["no metric upgrade"]().plot(TRACKS)
+    with pytest.raises(ArgumentError, match="is a SavedResult, which has no picture"):
+        SavedResult(kind="x").plot()
+    with pytest.raises(ArgumentError, match="x1 has 3 matches"):
+        MADE["homography"]().plot(VIEW.x1[:3], VIEW.x2[:3])
 
 
 def test_public_methods_are_described_with_an_example() -> None:

@@ -54,9 +54,9 @@ class MetricReconstruction(ReconstructionBase):
     --------
     >>> import epigauge as eg, numpy as np
     >>> cameras = eg.Cameras("SIMPLE_PINHOLE", [[800.0, 320.0, 240.0]], [0])
-    >>> scene = eg.MetricReconstruction(np.eye(3)[None], [[0, 0, 0]], [[0, 0, 4.0]], cameras)
-    >>> scene.centres.tolist(), scene.P.shape
-    ([[0.0, 0.0, 0.0]], (1, 3, 4))
+    >>> scene = eg.MetricReconstruction(np.eye(3)[None], [[1, 0, 2]], [[0, 0, 4.0]], cameras)
+    >>> (scene.centres + 0.0).tolist(), scene.P.shape
+    ([[-1.0, 0.0, -2.0]], (1, 3, 4))
     """
 
     R: Array

@@ -8,6 +8,7 @@ from epigauge.plots.comparison import plot_comparison
 from epigauge.plots.many_views import plot_bundle
 from epigauge.plots.pair import plot_pair
 from epigauge.plots.precision import plot_precision
+from epigauge.plots.results import plot_result
 from epigauge.plots.two_views import plot_refinement
 
 __all__ = [
@@ -16,5 +17,6 @@ __all__ = [
     "plot_pair",
     "plot_precision",
     "plot_refinement",
+    "plot_result",
     "save_figure",
 ]

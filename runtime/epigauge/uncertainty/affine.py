@@ -37,7 +37,7 @@ _FRAME = 4
 
 
 @dataclass(frozen=True)
-class AffineStd:
+class AffineStd(Result):
     """Standard deviations.
 
     Attributes
