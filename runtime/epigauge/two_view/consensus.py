@@ -18,6 +18,7 @@ from epigauge import lm
 from epigauge.kernels import Table
 from epigauge.linear import Levenberg
 from epigauge.two_view import mixture_native
+from epigauge.two_view.chance import CEILING, chance_agreement, log10_false_alarms
 from epigauge.two_view.conditioning import RMS
 from epigauge.two_view.criteria import Reprojection
 from epigauge.two_view.eliminated import EliminatedProblem
@@ -60,9 +61,15 @@ _ROUNDS = 5
 #: right matches, the likelihood has no other maximum that subsets of the right ones lead to.
 _NARROW, _PLENTY = 0.0025, 50
 
+#: Where more agreements as good are expected by chance than 10 to this, there are hardly right
+#: matches to draw subsets from: what they lead to is climbed from only if it is better as it is.
+_HOPELESS = 8.0
+
 #: Without a start: so many times the subsets of the smallest size, of which one in 256 is clean
-#: with half of the matches right; and the noise they are judged with, as shares of the range.
+#: with half of the matches right; the matches they are drawn from and judged by, enough to tell
+#: such a half; and the noise they are judged with, as shares of the range.
 _BLIND = 12
+_BLIND_FEW = 500
 _SIGMAS = (0.0003, 0.001, 0.003)
 
 #: What is found without a start is better by at least this logarithm of the likelihood: F of least
@@ -217,25 +224,44 @@ class Consensus:
             pool = np.flatnonzero(best.inliers(3.0 * best.sigma)[self.few])
             if len(pool) <= _SIZES[0]:
                 break
-            starts = self.promising(self.subset_fits(pool, rng), best)
-            climbed = [self.climb(self.judge(F, best.sigma, best.share)) for F in starts]
-            highest = max(climbed, key=_score)
+            promising = self.promising(self.subset_fits(pool, rng), best)
+            starts = [self.judge(F, best.sigma, best.share) for F in promising]
+            if self._is_hopeless(best):
+                starts = [start for start in starts if start.score > best.score]
+            highest = max(map(self.climb, starts), key=_score, default=best)
             if highest.score <= best.score + _CLIMBED:
                 break
             best = highest
         return best
+
+    def _is_hopeless(self, found: Agreement) -> bool:
+        """Tell whether an agreement is by far no better than those of wrong matches."""
+        limit = min(found.mixture.even, CEILING * RANGE)
+        agreed = int(np.count_nonzero(found.inliers(limit)))
+        criterion = self.criterion
+        chance = chance_agreement(criterion.kernels, found.F, criterion.q1, criterion.q2, limit)
+        return log10_false_alarms(len(found.signed), agreed, chance) > _HOPELESS
 
     def better(self, own: Agreement, rng: np.random.Generator) -> Agreement:
         """Search without a front end: from subsets of all matches, if they lead above an agreement.
 
         Returns the agreement itself where they do not.
         """
-        pool = np.arange(self.products.shape[1])
-        fits = self.subset_fits(pool, rng, _SIZES[:1] * _BLIND)
+        step = -(-len(own.signed) // _BLIND_FEW)
+        criterion = self.criterion
+        thin = Consensus(
+            criterion.kernels,
+            np.ascontiguousarray(criterion.q1[:, ::step]),
+            np.ascontiguousarray(criterion.q2[:, ::step]),
+            self.widest,
+        )
+        pool = np.arange(thin.products.shape[1])
+        fits = thin.subset_fits(pool, rng, _SIZES[:1] * _BLIND)
+        squared = thin.sampson(fits)
         found = own
         for sigma in _SIGMAS:
             guess = replace(own, sigma=sigma * RANGE, share=0.5)
-            trial = self.judge(self.promising(fits, guess)[0], guess.sigma)
+            trial = self.judge(thin.promising(fits, guess, squared)[0], guess.sigma)
             found = max(found, trial, key=_score)
         return own if found.score <= own.score + _HIGHER else self.search([found], rng)
 
@@ -257,15 +283,18 @@ class Consensus:
         U, values, Vt = np.linalg.svd(np.linalg.eigh(N)[1][:, :, 0].reshape(-1, 3, 3))
         return np.asarray((U[:, :, :2] * values[:, None, :2]) @ Vt[:, :2])
 
-    def promising(self, F: Array, best: Agreement) -> Array:
-        """Return the few of many geometries that lead highest, after refits to their inliers."""
+    def promising(self, F: Array, best: Agreement, squared: Array | None = None) -> Array:
+        """Return the few of many geometries that lead highest, after refits to their inliers.
+
+        Their squared distances (k, few) are computed unless they are given.
+        """
         mixture = best.mixture
         for keep in (len(F) // 4, len(F) // 10, _CLIMBERS):
-            squared = self.sampson(F)
+            squared = self.sampson(F) if squared is None else squared
             order = np.argsort(-np.sum(mixture.logarithm(squared), axis=1))[:keep]
             F = F[order]
             if keep > _CLIMBERS:
-                F = self.linear_fits(mixture(squared[order])[1])
+                F, squared = self.linear_fits(mixture(squared[order])[1]), None
         return F
 
     def sampson(self, F: Array) -> Array:

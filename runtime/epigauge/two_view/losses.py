@@ -100,7 +100,7 @@ class Mixture:
     def _logarithms(self, squared: Array) -> tuple[Array, Array]:
         """Return the logarithms of exp(-d^2 / (2 sigma^2)) and of that plus odds."""
         logarithm = -0.5 * squared / self.sigma**2
-        return logarithm, np.logaddexp(logarithm, np.log(self.odds))
+        return logarithm, np.log(np.exp(logarithm) + self.odds)
 
 
 def median(values: Array) -> float:
