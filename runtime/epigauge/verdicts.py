@@ -112,7 +112,7 @@ FLAGS = {
     "undetermined": Flag(
         "some parameters can change without changing any residual",
         "add matches or views that fix them, or hold them fixed",
-        ("F", "E", "views"),
+        ("F", "E", "H", "views"),
     ),
     "not tied": Flag(
         "the views or points fall into parts that share nothing that counts: each part has a frame "

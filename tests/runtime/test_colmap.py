@@ -16,6 +16,7 @@ import pytest
 from colmap_databases import Project, change, content, pair_id
 from epigauge.io import _sqlite
 from epigauge.io.colmap import ColmapDatabase
+from epigauge.io.colmap_matches import database_matches
 from two_views import up_to_sign
 
 PROJECT = Project()
@@ -65,6 +66,22 @@ def test_pairs_are_the_keypoints_that_inliers_join(tmp_path, cols) -> None:
                 assert np.isnan(part.F[k]).all()
             else:
                 np.testing.assert_allclose(part.F[k], PROJECT.F[pair], rtol=1e-14)
+
+
+def test_matches_of_a_database_are_its_inliers_from_the_middle_of_pixels(database) -> None:
+    empty = change(
+        database,
+        "UPDATE two_view_geometries SET rows = 0, data = ? WHERE pair_id = ?",
+        parameters=(b"", pair_id(*PAIRS[-1])),
+    )
+    found = database_matches(empty)
+    assert found.names == tuple(f"{k}.jpg" for k in PROJECT.keypoints)
+    assert list(found.pairs) == [(i - 1, j - 1) for i, j in PAIRS[:-1]]
+    for pair, rows in found.pairs.items():
+        ends = [found.points[image][own] + 0.5 for image, own in zip(pair, rows.T, strict=True)]
+        expected = PROJECT.points((pair[0] + 1, pair[1] + 1))
+        both = (np.hstack(ends), np.hstack(expected))
+        np.testing.assert_allclose(*(np.array(sorted(map(tuple, x))) for x in both))
 
 
 def test_a_database_made_by_colmap_reads_the_same(by_colmap, database) -> None:

@@ -145,7 +145,7 @@ class TestRefinement:
         assert "still camera" not in known.flags
         assert np.isfinite(known.covariance).all()
 
-    @pytest.mark.parametrize("m", [8, 60])
+    @pytest.mark.parametrize("m", [5, 6, 7, 8, 60])
     @pytest.mark.parametrize("loss", ["linear", "cauchy"])
     def test_random_matches_are_not_said_to_agree(self, m: int, loss: Any) -> None:
         for seed in range(3):

@@ -60,6 +60,8 @@ def test_reconstruction_comes_back_alone_and_with_tracks(tmp_path) -> None:
         found = eg.load_reconstruction(tmp_path / name)
         np.testing.assert_array_equal(found.P, SCENE.true.P)
         np.testing.assert_array_equal(found.Q, SCENE.true.Q)
+    with pytest.raises(ArgumentError, match=r"\.npz"):
+        eg.save_reconstruction(tmp_path / "r.csv", SCENE.true)
     with pytest.raises(FileFormatError, match="holds a reconstruction but no tracks"):
         eg.load_tracks(tmp_path / "r.npz")
 

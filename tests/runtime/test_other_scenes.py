@@ -241,6 +241,9 @@ def test_gltf_holds_points_and_cameras_that_see_them(model: str, tmp_path: Path)
     count, kind = struct.unpack("<I4s", data[20 + size : 28 + size])
     binary = data[28 + size :]
     assert (kind, count % 4, len(binary)) == (b"BIN\0", 0, count)
+    roots = document["scenes"][document["scene"]]["nodes"]
+    reached = [child for root in roots for child in (root, *document["nodes"][root]["children"])]
+    assert sorted(reached) == list(range(len(document["nodes"])))
     position, colour = document["accessors"]
     X = np.frombuffer(binary, "<f4", 3 * position["count"]).reshape(-1, 3)
     np.testing.assert_allclose(X, truth.X, rtol=1e-6)
@@ -264,6 +267,16 @@ def test_gltf_holds_points_and_cameras_that_see_them(model: str, tmp_path: Path)
             expected = tracks.xy[tracks.view == i]
         rows = tracks.point[tracks.view == i]
         np.testing.assert_allclose(shown[rows], expected, atol=8.0)  # noise and distortion
+
+
+def test_gltf_frames_images_of_unknown_size_by_what_was_seen(tmp_path: Path) -> None:
+    tracks, truth = metric_scene("PINHOLE", 2, noise_px=0.2)
+    eg.save_scene(tmp_path / "scene.glb", tracks, truth)
+    data = (tmp_path / "scene.glb").read_bytes()
+    document = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+    for i, camera in enumerate(document["cameras"]):
+        width, height = np.ptp(tracks.xy[tracks.view == i], axis=0)
+        assert camera["perspective"]["aspectRatio"] == pytest.approx(width / height)
 
 
 def test_colmap_folders_keep_names_and_sizes(tmp_path: Path) -> None:

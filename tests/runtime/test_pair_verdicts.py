@@ -126,13 +126,30 @@ class TestNothingInCommon:
         assert all("few matches" in flags and "not oriented" not in flags for flags in passed)
 
     @needs_a_front_end
-    @pytest.mark.parametrize("m", [20, 100])
+    @pytest.mark.parametrize("m", [20, 100, 1000])
     def test_random_matches_into_estimate(self, m) -> None:
         x1, x2 = np.random.default_rng(m).uniform([0, 0], SIZE, (2, m, 2))
         result = eg.estimate_fundamental(x1, x2)
         assert "no common geometry" in result.flags
         assert not result.success
         assert result.threshold_px < 0.03 * max(SIZE)
+
+    @needs_a_front_end
+    @pytest.mark.parametrize("places", [1, 3])
+    def test_matches_that_lead_to_few_places(self, places) -> None:
+        rng = np.random.default_rng(places)
+        K = np.array([[1000.0, 0.0, 640.0], [0.0, 1000.0, 480.0], [0.0, 0.0, 1.0]])
+        for m in (12, 40):
+            x1, x2 = rng.uniform([0, 0], SIZE, (2, m, 2))
+            x2[3:] = x2[rng.integers(0, places, m - 3)]
+            for find in (eg.estimate_fundamental, eg.estimate_homography):
+                result = find(x1, x2)
+                assert "no common geometry" in result.flags
+                assert not result.success
+                assert result.inlier.any()
+            assert not eg.estimate_essential(x1, x2, K).success
+            for calibration in (None, K):
+                assert eg.estimate_two_view(x1, x2, calibration).model == "nothing"
 
     def test_many_points_matched_to_one_agree_with_any_line_through_it(self) -> None:
         rng = np.random.default_rng(0)

@@ -318,7 +318,8 @@ def test_what_a_form_has_no_place_for_is_named(tmp_path: Path) -> None:
 def test_a_folder_with_a_model_of_the_other_form_is_not_mixed_up(tmp_path: Path) -> None:
     scene = metric_scene("SIMPLE_RADIAL")
     eg.save_scene(tmp_path, *scene, text=True)
-    assert "cameras.txt of another model" in refusal(eg.save_scene, tmp_path, *scene)
+    told = refusal(eg.save_scene, tmp_path, *scene)
+    assert "cameras.txt of another model; needed: an empty folder, or text=True" in told
     eg.save_scene(tmp_path, *scene, text=True)
 
 
@@ -395,6 +396,16 @@ def test_bad_text_is_refused_with_its_line(
     assert count
     path.write_text(text)
     assert told in refusal(eg.load_scene, tmp_path)
+
+
+def test_text_with_more_features_than_are_read_is_refused(
+    good: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tracks, _ = eg.load_scene(good)
+    monkeypatch.setattr("epigauge.io._colmap_text.MAX_MATCHES", len(tracks) - 1)
+    assert f"more than {len(tracks) - 1}" in refusal(eg.load_scene, good)
+    monkeypatch.setattr("epigauge.io._colmap_text.MAX_MATCHES", len(tracks))
+    eg.load_scene(good)
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])

@@ -353,7 +353,7 @@ def _flags(
     if wide or few:
         chance = chance_on_plane(problem.kernels, state.H, q1, q2, math.sqrt(np.max(plain)))
         alarms = log10_false_alarms(n, len(plain), chance, LEAST)
-        if alarms > (0.0 if few else SIGNIFICANT):
+        if alarms > (SIGNIFICANT if wide else 0.0):
             told["no common geometry"] = True
             return ordered(name for name, raised in told.items() if raised)
     moved = q2 - q1 - (to2[:2, 2] - to1[:2, 2])[:, None]

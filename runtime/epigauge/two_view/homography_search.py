@@ -139,7 +139,8 @@ def estimate_homography(
     -------
     HomographyResult
         As `refine_homography`, with the inliers. The flag "no common geometry" says that no more
-        matches agree than wrong ones would by chance.
+        matches agree than wrong ones would by chance; "undetermined" that all which agree are in
+        one place or on one line of an image, and H, that of all matches, means nothing.
 
     Raises
     ------
@@ -179,6 +180,7 @@ def estimate_homography(
     mixture = PlaneMixture.of(plane_squares(table, H, q1, q2), SCALES[0])
     result, limit = None, 0.0
     tried: set[bytes] = set()
+    is_open = False
     for _ in range(_ROUNDS):
         squared = plane_squares(table, H, q1, q2)
         mixture = PlaneMixture.of(squared, mixture.sigma)
@@ -188,19 +190,21 @@ def estimate_homography(
         if np.count_nonzero(inlier) < LEAST:
             inlier = np.zeros(len(rows), np.bool_)
             inlier[np.argsort(squared, kind="stable")[:LEAST]] = True
-        if inlier.tobytes() in tried:
+        if is_open or inlier.tobytes() in tried:
             break
         tried.add(inlier.tobytes())
-        chosen = of_matches(options, len(x1), rows[inlier])
-        try:
-            result = refine_homography(y1[inlier], y2[inlier], frame_to_pixels(frame, H), **chosen)
-        except ArgumentError as error:
-            if error.argument not in ("x1", "x2"):
-                raise
-            raise ArgumentError(
-                error.argument, "has all points that agree on one line", "spread matches"
-            ) from None
+        H0: Array | None = frame_to_pixels(frame, H)
         used = inlier
+        while True:
+            chosen = of_matches(options, len(x1), rows[used])
+            try:
+                result = refine_homography(y1[used], y2[used], H0, **chosen)
+                break
+            except ArgumentError as error:
+                if is_open or error.argument not in ("x1", "x2", "H0"):
+                    raise
+            # All that agree are in one place or on one line, and leave H open: fitted to all
+            used, H0, is_open = np.ones(len(rows), np.bool_), None, True
         to1, to2 = frame.maps_from_pixels()
         H = to2 @ result.H @ np.linalg.inv(to1)
         H /= np.linalg.norm(H)
@@ -209,13 +213,14 @@ def estimate_homography(
     agreed = int(np.count_nonzero(plane_squares(table, H, q1, q2)[used] <= bound**2))
     chance = chance_on_plane(table, H, q1, q2, bound)
     alarms = log10_false_alarms(len(rows), agreed, chance, LEAST)
-    flags = ("no common geometry",) if alarms > SIGNIFICANT else ()
+    flags = ("no common geometry",) * bool(alarms > SIGNIFICANT) + ("undetermined",) * is_open
     if threshold is None and options.get("noise_px") is None and np.isfinite(result.noise_px):
         tails = 1.0 / math.sqrt(_KEPT)  # the threshold has cut them off
         result = replace(
             result, noise_px=result.noise_px * tails, covariance=result.covariance * tails**2
         )
-    result = replace(result, inlier=used[copies], used=rows[used], threshold_px=limit * frame.scale)
+    agrees = (inlier if is_open else used)[copies]
+    result = replace(result, inlier=agrees, used=rows[used], threshold_px=limit * frame.scale)
     return with_flags(result, flags)
 
 

@@ -176,9 +176,8 @@ def estimate_two_view(
     calibration = calibrations(K1 is not None, K1, K2)
     x1, x2 = as_matches(x1, x2, at_least=8, general_position=True)
     seed = as_count("seed", seed, at_least=0)
-    try:
-        plane: HomographyResult | None = estimate_homography(x1, x2, seed=seed, backend=backend)
-    except ArgumentError:  # the best agreement is one of points on a line: no homography
+    plane: HomographyResult | None = estimate_homography(x1, x2, seed=seed, backend=backend)
+    if plane is not None and "undetermined" in plane.flags:
         plane = None
     options: dict[str, Any] = {}
     if calibration is not None:

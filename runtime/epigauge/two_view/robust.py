@@ -27,6 +27,7 @@ from epigauge.two_view.front_ends import checked, start
 from epigauge.two_view.losses import robust_scale
 from epigauge.two_view.refine import calibrations, refine_fundamental
 from epigauge.two_view.result import FundamentalResult
+from epigauge.verdicts import ordered
 
 __all__ = ["Estimate", "RobustResult", "estimate_fundamental", "estimated", "of_matches"]
 
@@ -135,7 +136,9 @@ def estimate_fundamental(
     Returns
     -------
     RobustResult
-        As `refine_fundamental`, with the inliers and how they were found.
+        As `refine_fundamental`, with the inliers and how they were found. Where all matches that
+        agree are in one place or on one line of an image, F is that of all matches, and the flag
+        "undetermined" says that it means nothing.
 
     Raises
     ------
@@ -219,18 +222,21 @@ def estimated(
     limit = threshold / frame.scale if threshold is not None else _at_most(agreement.mixture.even)
     inlier = _at_least(least, agreement, limit)
     fitted: set[bytes] = set()
-    while inlier.tobytes() not in fitted and len(fitted) < _ROUNDS:
+    is_open = False
+    while not is_open and inlier.tobytes() not in fitted and len(fitted) < _ROUNDS:
         fitted.add(inlier.tobytes())
         used, limit_px = inlier, limit * frame.scale
-        chosen = of_matches(options, len(x1), rows[used])
-        F0 = frame.to_pixels(agreement.F)
-        try:
-            refined = refine_fundamental(y1[used], y2[used], F0, **chosen)
-        except ArgumentError as error:
-            if error.argument not in ("x1", "x2"):
-                raise
-            where = "has all points that agree in one place or on one line"
-            raise ArgumentError(error.argument, where, "spread matches") from None
+        F0: Array | None = frame.to_pixels(agreement.F)
+        while True:
+            chosen = of_matches(options, len(x1), rows[used])
+            try:
+                refined = refine_fundamental(y1[used], y2[used], F0, **chosen)
+                break
+            except ArgumentError as error:
+                if is_open or error.argument not in ("x1", "x2", "F0"):
+                    raise
+            # All that agree are in one place or on one line, and leave F open: fitted to all
+            used, F0, is_open = np.ones(len(rows), np.bool_), None, True
         F = frame.from_pixels(refined.F)
         signed, oriented = consensus.measured(F)
         agreement = replace(agreement, F=F, signed=signed, oriented=oriented)
@@ -240,7 +246,7 @@ def estimated(
         inlier = _at_least(least, agreement, limit)
     plain = options["noise_px"] is None and options.get("loss", "linear") == "linear"
     known = {
-        "inlier": used[copies],
+        "inlier": (inlier if is_open else used)[copies],
         "used": rows[used],
         "threshold_px": limit_px,
         "rounds": len(fitted),
@@ -256,7 +262,7 @@ def estimated(
             bound = max(limit, _at_most(agreed.mixture.even))
         agreeing = agreed.inliers(bound)  # where fewer than 8, "no common geometry"
         pair = vars(refined).get("_pair")
-        if pair is not None:  # cheap tests, where they suffice
+        if pair is not None and not is_open:  # cheap tests, where they suffice
             flags, success = quick.verdict_of_raw(
                 *(pair, (raw.x1, raw.x2, raw.weights), frame.scale * agreed.signed, agreeing),
                 bound * frame.scale,
@@ -264,7 +270,12 @@ def estimated(
             )
             if flags is not None:
                 return SimpleNamespace(flags=flags, success=success)
-        return _judged(refined, raw, agreeing, bound * frame.scale)
+        verdict = _judged(refined, raw, agreeing, bound * frame.scale)
+        if is_open:
+            verdict = SimpleNamespace(
+                flags=ordered((*verdict.flags, "undetermined")), success=False
+            )
+        return verdict
 
     return Estimate(
         RobustResult.partial(
