@@ -128,7 +128,8 @@ FLAGS = {
     ),
     "open intrinsics": Flag(
         "a focal length, principal point or distortion is open, or uncertain by more than a tenth "
-        "of the focal length: a flat, distant or narrow scene, or views that all look one way",
+        "of the focal length: a flat, distant or narrow scene, views that all look one way, or a "
+        "camera of its own for every view",
         "hold those intrinsics (refine=...), give an IntrinsicPrior, or turn the camera",
     ),
     "flat scene": Flag(

@@ -320,10 +320,11 @@ class Tracks(Result):
             weak = np.flatnonzero(counts < least)
             if len(weak):
                 named = ", ".join(map(str, weak[:5])) + (", ..." if len(weak) > 5 else "")
+                fewer = "min_points=3 if its camera is calibrated, " if name == "view" else ""
                 raise ArgumentError(
                     name,
                     f"{named} has fewer than {least} observations ({counts[weak[0]]})",
-                    "more observations, or Tracks.pruned(...) to drop such views and points",
+                    f"more observations, {fewer}or Tracks.pruned(...) to drop such {name}s",
                 )
         parts = self._components()
         if parts.max() > 0:
