@@ -10,7 +10,7 @@ from typing import Any
 import epigauge as eg
 import numpy as np
 import pytest
-from epigauge.multi_view.verdicts.gross import gross_flags
+from epigauge.multi_view.verdicts.gross import TailOfArrays, gross_flags
 from epigauge.multi_view.verdicts.network import loose_parts, only_pairs
 from epigauge.reproduce.metrology import load_network
 from numpy.typing import NDArray
@@ -261,11 +261,11 @@ def test_tails_are_no_outliers() -> None:
     length = rng.gamma(2.0, 0.7, 4000)
     xy, usual = rng.uniform(0.0, 600.0, (4000, 2)), float(np.median(length)) / 1.1774
     assert np.mean(length > 4.0 * usual) > 0.01
-    assert gross_flags(length, usual, xy) == ()
+    assert gross_flags(TailOfArrays(length, xy), usual) == ()
     normal = np.linalg.norm(rng.normal(0.0, usual, (4000, 2)), axis=1)
-    assert gross_flags(normal, usual, xy) == ()
+    assert gross_flags(TailOfArrays(normal, xy), usual) == ()
     far = np.where(angle < 0.03, 30.0 * usual, normal)
-    assert gross_flags(far, usual, xy) == ("outliers",)
+    assert gross_flags(TailOfArrays(far, xy), usual) == ("outliers",)
 
 
 def test_weakest_names_what_moves() -> None:

@@ -12,8 +12,8 @@ from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.ties import Ties
 from epigauge.cameras import AnyReconstruction, CameraModel
 from epigauge.distributed.dispatch import Dispatch
-from epigauge.distributed.linearizer import DistributedLinearizer, Piece
-from epigauge.distributed.partition import Observations
+from epigauge.distributed.linearizer import DistributedLinearizer
+from epigauge.distributed.pieces import cut
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 from epigauge.multi_view.adjust import BundleResult
@@ -25,9 +25,6 @@ __all__ = ["bundle_adjust"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-
-#: Observations of a partition, about, and least number of partitions where points suffice.
-_SIZE, _LEAST = 250_000, 8
 
 
 class Workers:
@@ -64,32 +61,6 @@ class Workers:
     def close(self) -> None:
         """Let the workers forget everything."""
         self._dispatch.sweep()
-
-
-def cut(
-    graph: ObservationGraph, q: Array, weights: Array, whitening: Array | None, count: int | None
-) -> list[Piece]:
-    """Cut observations into partitions of about equal size, neighbouring points together.
-
-    How many depends on the observations alone: so do the sums, to the last bit.
-    """
-    N, m = len(graph.point), graph.n_points
-    wanted = count if count is not None else max(_LEAST, -(-N // _SIZE))
-    first, view = graph.first, graph.view
-    order = np.lexsort((view[first[1:] - 1], view[first[:-1]]))
-    sizes = np.diff(first)[order]
-    ends = np.searchsorted(np.cumsum(sizes), N * np.arange(1, wanted + 1) / wanted - 0.5) + 1
-    ends = np.unique(np.minimum(ends, m))
-    pieces = []
-    for begin, end in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True):
-        points, counts = order[begin:end], sizes[begin:end]
-        starts = np.concatenate([[0], np.cumsum(counts)])
-        own = np.repeat(np.arange(end - begin), counts)
-        rows = first[points][own] + np.arange(starts[-1]) - starts[own]
-        white = None if whitening is None else np.ascontiguousarray(whitening[..., rows])
-        parts = view[rows], own, np.ascontiguousarray(q[:, rows]), weights[rows], white
-        pieces.append(Piece(points, Observations(*parts), rows))
-    return pieces
 
 
 def bundle_adjust(

@@ -31,6 +31,8 @@ class Dispatch:
     ----------
     client : distributed.Client
         Connected to a scheduler.
+    limit : int, optional
+        Bytes of observations that a worker holds laid out beside those in use; by default all.
 
     Raises
     ------
@@ -38,7 +40,8 @@ class Dispatch:
         If it is none, is closed, or has no workers.
     """
 
-    def __init__(self, client: Any) -> None:
+    def __init__(self, client: Any, limit: int | None = None) -> None:
+        self.limit = limit
         if not all(callable(getattr(client, name, None)) for name in ("submit", "scatter")):
             was = f"is of type {type(client).__name__}"
             raise ArgumentError("client", was, "a distributed.Client, as Client() returns")
@@ -152,6 +155,7 @@ class Run:
                 payload = Payload(
                     {} if own is None else {k: own(k) for k in part},
                     {k: self._recipe(k) for k in part if k not in self._there},
+                    self._dispatch.limit,
                 )
                 arguments = self.name, self.count, part, call, common, payload
                 task = _Task(self._dispatch, address, part)

@@ -11,46 +11,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge._native import Blocks
-from epigauge.bundle.dense import DensePairs
-from epigauge.bundle.lanes import FULL
 from epigauge.bundle.linearizer import Normal, Pairs, PointRefinement
-from epigauge.bundle.native_linearizer import NativeLinearizer, NativePairs, is_direct
+from epigauge.bundle.native_linearizer import is_direct
 from epigauge.bundle.numpy_linearizer import DENSE_CAMERAS, inverse_roots
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.problem import BundleProblem
-from epigauge.bundle.skyline import Skyline, narrow
+from epigauge.bundle.skyline import Skyline
 from epigauge.cameras import CameraModel
 from epigauge.distributed.dispatch import Dispatch, Run
-from epigauge.distributed.partition import Observations, Order, Setup
-from epigauge.distributed.sums import Rows
-from epigauge.distributed.worker import Recipe, Source
+from epigauge.distributed.observations import Order, Setup
+from epigauge.distributed.pieces import Piece, order_of_cameras
+from epigauge.distributed.reduced import Reduced
+from epigauge.distributed.worker import Recipe
 from epigauge.kernels import Table
 from epigauge.two_view.losses import Loss
 
-__all__ = ["DistributedCoupling", "DistributedLinearizer", "Piece", "Reduced"]
+__all__ = ["DistributedCoupling", "DistributedLinearizer"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-
-
-@dataclass(frozen=True)
-class Piece:
-    """A partition as the client knows it.
-
-    Attributes
-    ----------
-    points : ndarray of int, shape (m_k,)
-        Numbers of its points among all.
-    source : Observations or Source
-        Its observations.
-    rows : ndarray of int, shape (N_k,), or None
-        Numbers of its observations among all, where the client has them.
-    """
-
-    points: Indices
-    source: Observations | Source
-    rows: Indices | None = None
 
 
 class DistributedLinearizer:
@@ -100,10 +79,7 @@ class DistributedLinearizer:
         self._more = used, heaviest, solver, graph
         self.dispatch, self.pieces, self.sizes, self.model = dispatch, pieces, sizes, model
         self.loss, self.kernels, self._solver, self._graph = loss, kernels, solver, graph
-        self._compiled = kernels.compiled and not any(
-            isinstance(piece.source, Observations) and piece.source.whitening is not None
-            for piece in pieces
-        )
+        self._compiled = kernels.compiled and not any(piece.source.whitened for piece in pieces)
         if not self._compiled or model.homogeneous:
             used = None
         self._used = used
@@ -124,16 +100,9 @@ class DistributedLinearizer:
 
     def _ordered(self) -> Order:
         n = self.sizes[0]
-        own = np.arange(n)
         if not self._compiled:
-            return Order(own, Skyline.full(n))
-        survey = Survey(self.dispatch, self.pieces)
-        skyline, order = Skyline.full(n), None
-        if n > FULL:
-            skyline = Skyline.of(survey.lowest(n))
-        if skyline.wide:
-            skyline, order = narrow(survey.together(n))
-        return Order(own if order is None else np.argsort(order), skyline)
+            return Order(np.arange(n), Skyline.full(n))
+        return order_of_cameras(self.dispatch, self.pieces, n)
 
     @property
     def graph(self) -> ObservationGraph:
@@ -240,37 +209,6 @@ def _recipe(own: weakref.ref[DistributedLinearizer], number: int) -> Recipe:
     return linearizer.recipe(number)
 
 
-class Survey:
-    """Questions to the partitions before there is an order of the cameras."""
-
-    def __init__(self, dispatch: Dispatch, pieces: list[Piece]) -> None:
-        self._dispatch, self._pieces = dispatch, pieces
-
-    def lowest(self, n: int) -> Indices:
-        """Return the lowest view that shares a point with each, (n,)."""
-        found = np.arange(n)
-        for rows in self._asked("lowest", np.arange(n)):
-            found[rows.index] = np.minimum(found[rows.index], rows.values.astype(np.intp))
-        return found
-
-    def together(self, n: int) -> NDArray[np.bool_]:
-        """Return which pairs of views share a point, (n, n)."""
-        bits = np.zeros(-(-n * n // 8), np.uint8)
-        for own in self._asked("together", n):
-            bits |= own
-        return np.unpackbits(bits, count=n * n).reshape(n, n).astype(np.bool_)
-
-    def _asked(self, question: str, argument: Any) -> list[Any]:
-        here = [piece.source for piece in self._pieces]
-        if all(isinstance(source, Observations) for source in here):
-            return [getattr(source, question)(argument) for source in here]
-        run = Run(self._dispatch, len(here), lambda k: Recipe(None, here[k]))
-        try:
-            return run.each("survey", (question, argument))[1]
-        finally:
-            run.release()
-
-
 @dataclass(frozen=True)
 class DistributedCoupling:
     """The blocks W of J^T J that couple cameras and points, computed where the points are."""
@@ -313,70 +251,3 @@ class DistributedCoupling:
     def _summed(self, call: str, *arrays: Array | None) -> tuple[Any, ...]:
         own = self.linearizer
         return own.run.each(call, (self.cameras,), own.own(self.points, *arrays))[0]
-
-
-class Reduced:
-    """The order of the cameras in the reduced system, as `NativePairs` asks for it.
-
-    Parameters
-    ----------
-    model : CameraModel
-        The camera.
-    order : Order
-        Of the cameras.
-    used : ndarray of int, or None
-        Entries of a tangent that are computed with.
-    width : int
-        How many.
-    compiled : bool
-        Whether blocks are those of a skyline that the C library factors.
-    """
-
-    #: Pairs come as blocks whatever the model.
-    factored = True
-
-    def __init__(
-        self,
-        model: CameraModel,
-        order: Order,
-        used: Indices | None,
-        width: int,
-        compiled: bool,
-    ) -> None:
-        self.model, self.width, self._used, self._compiled = model, width, used, compiled
-        self.skyline, self.number = order.skyline, order.number
-        self.order = np.argsort(order.number)
-
-    @property
-    def layout(self) -> _Rows:
-        """Return what reorders rows of cameras."""
-        return _Rows(self.number, self.order)
-
-    spread_out = NativeLinearizer.spread_out
-    narrow = NativeLinearizer.narrow
-    wide = NativeLinearizer.wide
-
-    def outward(self, rows: Rows) -> Array:
-        """Return a sum over partitions in the caller's order, (n, ...)."""
-        return rows.spread(len(self.number))[self.number]
-
-    def pairs(self, blocks: Rows) -> Pairs:
-        """Return the pairs of summed blocks."""
-        values = np.ascontiguousarray(blocks.spread(self.skyline.blocks))
-        own: Any = self
-        pairs = NativePairs(own, self.skyline, values, Blocks.dense(self.width))
-        return pairs if self._compiled else DensePairs(pairs.dense())
-
-
-@dataclass(frozen=True)
-class _Rows:
-    number: Indices
-    order: Indices
-
-    def inward(self, cameras: Any) -> Any:
-        """Return rows of cameras in the order of the reduced system, contiguous."""
-        return None if cameras is None else np.ascontiguousarray(cameras[self.order])
-
-    def outward(self, cameras: Array) -> Array:
-        """Return rows of cameras in the caller's order."""
-        return cameras[self.number]

@@ -6,24 +6,18 @@ import threading
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.distributed.partition import Observations, Partition, Setup
+from epigauge.distributed.observations import Observations, Setup, Source
+from epigauge.distributed.partition import Partition
 from epigauge.distributed.sums import Node, Terms, combined
 
-__all__ = ["Payload", "Recipe", "Reply", "Source", "forget", "serve"]
+__all__ = ["Payload", "Recipe", "Reply", "forget", "serve"]
 
 Array = NDArray[np.float64]
-
-
-class Source(Protocol):
-    """Where a partition's observations come from."""
-
-    def load(self) -> Observations:
-        """Return them."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +47,9 @@ class Recipe:
     def made(self) -> Partition | Observations:
         """Return the partition, or its observations alone."""
         source = self.source
-        observations = source if isinstance(source, Observations) else source.load()
-        if self.setup is None:
-            return observations
-        return Partition(self.setup, observations, self.kept)
+        if self.setup is not None:
+            return Partition(self.setup, source, self.kept)
+        return source if isinstance(source, Observations) else source.load()
 
     def restore(self, partition: Partition, token: int) -> None:
         """Bring a partition to a state."""
@@ -70,10 +63,19 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Payload:
-    """What goes to one worker alone: arguments and recipes of its partitions, by their number."""
+    """What goes to one worker alone.
+
+    Attributes
+    ----------
+    own, recipes : mapping
+        Arguments and recipes of its partitions, by their number.
+    limit : int or None
+        Bytes of observations that it holds laid out beside those in use; None for all.
+    """
 
     own: Mapping[int, tuple[Any, ...]] = field(default_factory=dict)
     recipes: Mapping[int, Recipe] = field(default_factory=dict)
+    limit: int | None = None
 
 
 class Reply(NamedTuple):
@@ -130,11 +132,18 @@ def serve(
             if recipe is None:
                 return None
             recipe.restore(partition, common[0])
-        found: tuple[Terms, Any] = getattr(partition, call)(*common, *payload.own.get(number, ()))
+        does = partition
+        if isinstance(partition, Partition) and call not in _AT_STATE:
+            does = partition.evaluation
+        found: tuple[Terms, Any] = getattr(does, call)(*common, *payload.own.get(number, ()))
+        if payload.limit is not None and _held(run) > payload.limit:
+            partition.drop()
         return found
 
-    with ThreadPoolExecutor(max(1, min(threads, len(numbers)))) as pool:
-        results = dict(zip(numbers, pool.map(one, numbers), strict=True))
+    # Those whose observations are here go first: the others take their place no sooner.
+    order = sorted(numbers, key=lambda number: not _laid_out(run, number))
+    with ThreadPoolExecutor(max(1, min(threads, len(order)))) as pool:
+        results = dict(zip(order, pool.map(one, order), strict=True))
     there = {number: result for number, result in results.items() if result is not None}
     terms = {(0, number): result[0] for number, result in there.items() if result[0]}
     own = {number: result[1] for number, result in there.items()}
@@ -149,6 +158,19 @@ def _partition(run: str, number: int, recipe: Recipe | None) -> Any:
         with _LOCK:
             _HELD[run, number] = held
     return held
+
+
+def _laid_out(run: str, number: int) -> bool:
+    with _LOCK:
+        held = _HELD.get((run, number))
+    return isinstance(held, Partition) and held.laid_out
+
+
+def _held(run: str) -> int:
+    """Return the bytes of observations that are laid out here."""
+    with _LOCK:
+        held = [one for key, one in _HELD.items() if key[0] == run]
+    return sum(one.nbytes for one in held if isinstance(one, Partition))
 
 
 def forget(runs: Sequence[str]) -> None:

@@ -33,6 +33,7 @@ from epigauge.multi_view.rejection import without_gross_errors
 from epigauge.multi_view.repeated import merging_sightings
 from epigauge.multi_view.result import BundleResult
 from epigauge.multi_view.tracks import Tracks
+from epigauge.multi_view.verdicts.evidence import EvidenceOfTracks
 from epigauge.multi_view.verdicts.metric import judged_metric
 from epigauge.multi_view.verdicts.projective import judged
 from epigauge.multi_view.verdicts.verdict import Verdict
@@ -325,11 +326,11 @@ def bundle_adjust(
             predicted, depths = reconstruction.seen(tracks)
         else:
             predicted, depths = reconstruction.project(tracks), None
-        free = fixed, job.fixes_gauge or reference, predicted, loss == "linear"
+        free = fixed, job.fixes_gauge or reference, loss == "linear"
 
         def judge() -> Verdict:
-            known = Frame.of(tracks), reconstruction, depths, outcome, table, *free
-            return judged_metric(tracks, *known)
+            evidence = EvidenceOfTracks(tracks, Frame.of(tracks).scale, predicted, depths)
+            return judged_metric(evidence, reconstruction, outcome, table, *free)
 
     else:
         linear = loss == "linear"

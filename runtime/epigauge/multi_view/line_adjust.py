@@ -27,7 +27,7 @@ from epigauge.multi_view.line_start import OPEN, checked_scene, spreads, triangu
 from epigauge.multi_view.line_tracks import LineTracks
 from epigauge.multi_view.tracks import Tracks
 from epigauge.multi_view.verdicts.front import BEHIND
-from epigauge.multi_view.verdicts.gross import gross_flags
+from epigauge.multi_view.verdicts.gross import TailOfArrays, gross_flags
 from epigauge.two_view.losses import EFFICIENT, Loss, median, robust_scale
 from epigauge.verdicts import ordered
 
@@ -186,8 +186,9 @@ def adjusted_lines(
         share = max(1.0 - rank / max(2 * len(sizes), 1), 1e-3)
         usual = median(sizes) / 1.1774 / float(np.sqrt(share))
         middles = 0.5 * (lines.segments[:, :2] + lines.segments[:, 2:])
+        measured = np.concatenate([tracks.xy, middles])
         if loss == "linear":
-            raised.update(gross_flags(sizes, usual, np.concatenate([tracks.xy, middles])[counts]))
+            raised.update(gross_flags(TailOfArrays(sizes, measured[counts]), usual))
         if diagnosis.missing:
             raised.add("undetermined")
         if (usual * spreads(system.normal.others[0].V) > OPEN).any():

@@ -9,8 +9,7 @@ from epigauge.bundle.point_blocks import Triangle
 from epigauge.bundle.solve import BundleSystem
 from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.multi_view.parallax import partners
-from epigauge.multi_view.seen import Seen
-from epigauge.multi_view.tracks import Tracks
+from epigauge.multi_view.verdicts.evidence import Evidence
 
 __all__ = ["distance_flags", "relative_depths"]
 
@@ -44,13 +43,13 @@ def relative_depths(system: BundleSystem, noise_px: float, free: NDArray[np.bool
 
 
 def distance_flags(
-    tracks: Tracks, found: MetricReconstruction, depths: Array, noise_px: float
+    evidence: Evidence, found: MetricReconstruction, depths: Array, noise_px: float
 ) -> tuple[str, ...]:
     """Return "still camera", "pure rotation", "points at infinity" or nothing.
 
     Parameters
     ----------
-    tracks : Tracks
+    evidence : Evidence
         Observations.
     found : MetricReconstruction
         Cameras and points.
@@ -59,31 +58,30 @@ def distance_flags(
     noise_px : float
         Standard deviation of a coordinate.
     """
-    if _turned(Seen.of_network(tracks), found, noise_px):
-        counts = np.bincount(tracks.point, minlength=tracks.n_points)
-        sums = [np.bincount(tracks.point, xy, tracks.n_points) / counts for xy in tracks.xy.T]
-        moved = np.linalg.norm(tracks.xy - np.stack(sums, axis=1)[tracks.point], axis=1)
-        still = np.mean(moved > _STAYS * noise_px) <= _CHANCE
+    if _turned(evidence, found, noise_px):
+        still = evidence.moved(_STAYS * noise_px) <= _CHANCE
         return ("still camera",) if still else ("pure rotation",)
     far = len(depths) > 0 and float(np.mean(depths > _OPEN)) > _MANY
     return ("points at infinity",) if far else ()
 
 
-def _turned(seen: Seen, found: MetricReconstruction, noise_px: float) -> bool:
+def _turned(evidence: Evidence, found: MetricReconstruction, noise_px: float) -> bool:
     """Tell whether a rotation takes the rays of each view to those of others, within the noise.
 
     The rays are those to the reconstructed points, whose own parallax the noise has made then.
     """
-    begin, centres = np.searchsorted(seen.point, np.arange(seen.m + 1)), found.centres
+    n, centres = found.n_views, found.centres
     limit = _PARALLAX * noise_px / _pixels_a_radian(found)
     asked = 0
-    for i in np.unique(np.linspace(0, seen.n - 1, min(seen.n, 10)).astype(np.intp)):
+    for i in np.unique(np.linspace(0, n - 1, min(n, 10)).astype(np.intp)):
+        seen = evidence.around(int(i))
+        begin, X = np.searchsorted(seen.point, np.arange(seen.m + 1)), found.X[seen.points]
         for k in partners(seen, begin, int(i)):
             both = np.zeros((2, seen.m), np.bool_)
             for side, one in enumerate((i, k)):
                 both[side, seen.point[seen.view == one]] = True
             common = np.flatnonzero(both[0] & both[1])
-            a, b = (found.X[common] - centres[one] for one in (i, k))
+            a, b = (X[common] - centres[one] for one in (i, k))
             a, b = (
                 v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-300) for v in (a, b)
             )

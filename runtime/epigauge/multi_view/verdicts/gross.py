@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["gross_flags"]
+from epigauge.two_view.losses import median
+
+__all__ = ["Tail", "TailOfArrays", "gross_flags"]
 
 Array = NDArray[np.float64]
 
@@ -31,26 +36,85 @@ _NEAR, _FAR = 4.0, 12.0
 _MANY_NEAR, _MANY_FAR, _APART, _FEW, _FEW_SHARE = 0.08, 0.02, 1.5, 3, 0.002
 
 
-def gross_flags(distances: Array, noise_px: float, xy: Array) -> tuple[str, ...]:
+class Tail(Protocol):
+    """Lengths of residuals, of which few numbers are asked, and where they were measured."""
+
+    @property
+    def count(self) -> int:
+        """Return how many there are."""
+
+    @property
+    def largest(self) -> float:
+        """Return the largest."""
+
+    @property
+    def sum_of_squares(self) -> float:
+        """Return the sum of their squares."""
+
+    @property
+    def median(self) -> float:
+        """Return their median."""
+
+    def above(self, limit: float) -> int:
+        """Return how many are above a limit."""
+
+    def ranked(self, axis: int, ranks: Sequence[int]) -> Array:
+        """Return measured coordinates of rising rank, from 0, in one direction of the image."""
+
+
+@dataclass(frozen=True)
+class TailOfArrays:
+    """Lengths (N,) and measurements (N, 2) that are here."""
+
+    distances: Array
+    xy: Array
+
+    @property
+    def count(self) -> int:
+        """Return how many there are."""
+        return len(self.distances)
+
+    @property
+    def largest(self) -> float:
+        """Return the largest."""
+        return float(self.distances.max())
+
+    @property
+    def sum_of_squares(self) -> float:
+        """Return the sum of their squares."""
+        return float(np.sum(self.distances**2))
+
+    @property
+    def median(self) -> float:
+        """Return their median."""
+        return median(self.distances)
+
+    def above(self, limit: float) -> int:
+        """Return how many are above a limit."""
+        return int(np.count_nonzero(self.distances > limit))
+
+    def ranked(self, axis: int, ranks: Sequence[int]) -> Array:
+        """Return measured coordinates of rising rank, from 0, in one direction of the image."""
+        return np.partition(self.xy[:, axis], ranks)[list(ranks)]
+
+
+def gross_flags(tail: Tail, noise_px: float) -> tuple[str, ...]:
     """Return "gross errors" where they spoil least squares, "outliers" where some are left.
 
     Parameters
     ----------
-    distances : ndarray, shape (N,)
+    tail : Tail
         Lengths of the residuals that count, times the roots of their weights.
     noise_px : float
         Standard deviation of a coordinate, as their median tells it.
-    xy : ndarray, shape (N, 2)
-        Where they were measured.
     """
-    largest = distances.max()
-    if largest <= _NEAR * noise_px:  # the extent can only raise the bounds
+    if tail.largest <= _NEAR * noise_px:  # the extent can only raise the bounds
         return ()
-    extent, N = _extent(xy), len(distances)
-    if _spoiled(distances, noise_px, extent):
+    extent, N = _extent(tail), tail.count
+    if _spoiled(tail, noise_px, extent):
         return ("gross errors",)
     usual = max(noise_px, _EXACT * extent)
-    near, far = (int(np.count_nonzero(distances > k * usual)) for k in (_NEAR, _FAR))
+    near, far = (tail.above(k * usual) for k in (_NEAR, _FAR))
     # Of normal errors exp(-8) are beyond four standard deviations.
     chance = N * float(np.exp(-0.5 * _NEAR**2))
     if near <= chance + 5.0 * max(chance, 1.0) ** 0.5:
@@ -60,24 +124,24 @@ def gross_flags(distances: Array, noise_px: float, xy: Array) -> tuple[str, ...]
     return ("outliers",) if left else ()
 
 
-def _spoiled(distances: Array, noise_px: float, extent: float) -> bool:
+def _spoiled(tail: Tail, noise_px: float, extent: float) -> bool:
     """Tell whether few residuals carry the cost, or more than a very few are very large."""
     usual = _HEAVY * max(noise_px, _EXACT * extent)
-    heavy = float(np.sqrt(np.mean(distances**2) / 2.0)) > usual
-    beyond = np.count_nonzero(distances > max(_BEYOND * extent, usual))
-    return bool(heavy or beyond > _TOO_FEW * len(distances))
+    heavy = float(np.sqrt(tail.sum_of_squares / tail.count / 2.0)) > usual
+    beyond = tail.above(max(_BEYOND * extent, usual))
+    return bool(heavy or beyond > _TOO_FEW * tail.count)
 
 
-def _extent(xy: Array) -> float:
+def _extent(tail: Tail) -> float:
     """Return the range of the coordinates, to which a few wild ones add little."""
-    last = len(xy) - 1
+    last = tail.count - 1
     places = [share * last for share in (0.005, 0.995)]
     kept = sorted(
         {0, last, *(k for place in places for k in (math.floor(place), math.ceil(place)))}
     )
     extents = []
-    for values in xy.T:  # several times as fast as a quantile of rows
-        rising = np.partition(values, kept)
-        low, high = np.interp(places, kept, rising[kept])
-        extents.append(min(rising[last] - rising[0], 1.3 * (high - low)))
+    for axis in (0, 1):  # several times as fast as a quantile of rows
+        rising = tail.ranked(axis, kept)
+        low, high = np.interp(places, kept, rising)
+        extents.append(min(rising[-1] - rising[0], 1.3 * (high - low)))
     return float(max(extents))

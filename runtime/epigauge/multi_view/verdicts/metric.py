@@ -7,23 +7,19 @@ from numpy.typing import NDArray
 
 from epigauge import lm
 from epigauge.bundle.diagnosis import Diagnosis, diagnosed
-from epigauge.bundle.observations import whitened
 from epigauge.bundle.problem import BundleState
 from epigauge.bundle.solve import BundleSystem
 from epigauge.cameras import AffineReconstruction, MetricReconstruction
 from epigauge.kernels import Table
-from epigauge.multi_view.frame import Frame
-from epigauge.multi_view.tracks import Tracks
 from epigauge.multi_view.verdicts.distant import distance_flags, relative_depths
+from epigauge.multi_view.verdicts.evidence import Evidence
 from epigauge.multi_view.verdicts.front import BEHIND
 from epigauge.multi_view.verdicts.gross import gross_flags
-from epigauge.multi_view.verdicts.network import why_open
 from epigauge.multi_view.verdicts.perspective import affine_views
 from epigauge.multi_view.verdicts.relief import flatness
 from epigauge.multi_view.verdicts.shape import flat_scene, one_line
 from epigauge.multi_view.verdicts.verdict import Verdict
 from epigauge.multi_view.verdicts.words import largest, named, of_points, tangent_sizes
-from epigauge.two_view.losses import median
 from epigauge.verdicts import ordered
 
 __all__ = ["judged_metric"]
@@ -46,29 +42,22 @@ _UNCERTAIN = 0.1
 
 
 def judged_metric(
-    tracks: Tracks,
-    frame: Frame,
+    evidence: Evidence,
     found: MetricReconstruction | AffineReconstruction,
-    depths: Array | None,
     outcome: lm.Outcome[BundleState],
     kernels: Table,
     known: Mask,
     fixes_gauge: bool,
-    predicted: Array,
     bends: bool,
 ) -> Verdict:
     """Judge an adjusted metric or affine reconstruction.
 
     Parameters
     ----------
-    tracks : Tracks
-        Observations.
-    frame : Frame
-        Of these.
+    evidence : Evidence
+        Observations, and how the reconstruction fits them.
     found : MetricReconstruction or AffineReconstruction
         Cameras and points, at the minimum.
-    depths : ndarray, shape (N,), or None
-        How far in front of its camera each observed point lies; None where cameras have no front.
     outcome : Outcome
         How the minimisation ended.
     kernels : Table
@@ -77,8 +66,6 @@ def judged_metric(
         Points that are fixed.
     fixes_gauge : bool
         Whether anything fixed or known ties the reconstruction to its frame.
-    predicted : ndarray, shape (N, 2)
-        Where the points are projected to.
     bends : bool
         Whether the loss lets few observations bend the result: least squares.
 
@@ -88,25 +75,20 @@ def judged_metric(
         Flags, rank, condition and weakest direction, and the number of observations that are not in
         front of their camera.
     """
-    metric = depths is not None
-    n_behind = 0 if depths is None else int(np.count_nonzero(~(depths > 0.0)))
-    raised = {"behind the cameras"} if n_behind > BEHIND * len(tracks) else set()
+    metric, n_behind = isinstance(found, MetricReconstruction), evidence.n_behind
+    raised = {"behind the cameras"} if n_behind > BEHIND * evidence.count else set()
     system, rank = outcome.system, 0
     condition, weakest = float("inf"), ""
     if isinstance(system, BundleSystem) and np.isfinite(outcome.state.cost):
         diagnosis = diagnosed(system, kernels, known, fixes_gauge)
         rank, condition = diagnosis.rank, diagnosis.condition
-        counts, xy, scale = tracks.weights > 0.0, tracks.xy, frame.scale
-        r = whitened(tracks.whitening, (xy - predicted).T)
-        distances = np.sqrt(tracks.weights * (r[0] ** 2 + r[1] ** 2))
-        if not counts.all():
-            distances, xy = distances[counts], xy[counts]
-        share_free = max(1.0 - rank / max(2 * len(distances), 1), 1e-3)
+        tail, scale = evidence.tail, evidence.scale
+        share_free = max(1.0 - rank / max(2 * tail.count, 1), 1e-3)
         # Of two normal coordinates, the median distance is 1.1774 standard deviations.
-        usual = median(distances) / 1.1774 / float(np.sqrt(share_free))
+        usual = tail.median / 1.1774 / float(np.sqrt(share_free))
         if bends:
-            raised.update(gross_flags(distances, usual, xy))
-        noise_px = float(np.sqrt(np.sum(distances**2) / share_free / max(2 * len(distances), 1)))
+            raised.update(gross_flags(tail, usual))
+        noise_px = float(np.sqrt(tail.sum_of_squares / share_free / max(2 * tail.count, 1)))
         # Affine cameras are computed with in other units of the image.
         noise = noise_px if metric else noise_px / scale
         sizes = tangent_sizes(system)
@@ -119,24 +101,21 @@ def judged_metric(
         flat = 0.0 if metric else flatness(found, noise_px)
         worst = float(shares.max(initial=0.0))
         if diagnosis.missing or flat > 1.0 or worst > 1.0:
-            raised.update(("undetermined", *why_open(tracks, tracks.weights <= 0.0)))
+            raised.update(("undetermined", *evidence.open()))
         elif flat > _WEAK or worst > _UNCERTAIN:
             raised.add("weak geometry")
         # Where the fit is bad, nothing is within its noise.
         if isinstance(found, MetricReconstruction) and usual < _FITS * scale:
             least, told = max(usual, 1e-9 * scale), worst > _UNCERTAIN
             shares = least * diagnosis.spread / sizes
-            causes = _causes(
-                tracks, found, predicted, system, diagnosis, least, shares, told, known
-            )
+            causes = _causes(evidence, found, system, diagnosis, least, shares, told, known)
             raised.update(causes)
     return Verdict(ordered(raised), rank, n_behind, condition, weakest)
 
 
 def _causes(
-    tracks: Tracks,
+    evidence: Evidence,
     found: MetricReconstruction,
-    predicted: Array,
     system: BundleSystem,
     diagnosis: Diagnosis,
     noise_px: float,
@@ -147,7 +126,7 @@ def _causes(
     """Return what makes calibrated cameras weak, by name."""
     free = system.ties.n_shared > 0 or _refines(system)
     depths = relative_depths(system, noise_px, ~known)
-    raised = list(distance_flags(tracks, found, depths, noise_px))
+    raised = list(distance_flags(evidence, found, depths, noise_px))
     opened = shares[:, _POSE:].max(initial=0.0) > _UNCERTAIN
     if diagnosis.open is not None:
         size = np.abs(diagnosis.open)
@@ -156,7 +135,7 @@ def _causes(
         raised.append("open intrinsics")
     if free and flat_scene(system, noise_px):
         raised.append("flat scene")
-    if affine_views(tracks, found.X, predicted, noise_px):
+    if affine_views(evidence, found.X, noise_px):
         raised.append("near-affine")
     if (weak or diagnosis.missing or diagnosis.gauge == 1) and one_line(found.centres):
         raised.append("collinear centres")

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from epigauge.multi_view.parallax import partners
 from epigauge.multi_view.seen import Seen
-from epigauge.multi_view.tracks import Tracks
+from epigauge.multi_view.verdicts.evidence import Evidence
 
 __all__ = ["affine_pairs", "affine_views"]
 
@@ -22,35 +22,31 @@ _LEAST = 8
 _PAIR = 0.3
 
 
-def affine_views(tracks: Tracks, X: Array, images: Array, noise_px: float) -> bool:
+def affine_views(evidence: Evidence, X: Array, noise_px: float) -> bool:
     """Tell whether each view's images are an affine function of the points, within the noise.
 
     Parameters
     ----------
-    tracks : Tracks
+    evidence : Evidence
         Observations; those of weight zero do not count.
     X : ndarray, shape (m, 3)
         The points.
-    images : ndarray, shape (N, 2)
-        Where the cameras project them to.
     noise_px : float
         Standard deviation of a coordinate.
     """
-    weighted = tracks.weights > 0.0
-    view = np.where(weighted, tracks.view, -1)
-    counts = np.bincount(view[weighted], minlength=1)
+    counts = evidence.of_views
     asked = 0
     # The first that shows perspective ends it: those with the most points are asked first.
     for i in np.argsort(-counts, kind="stable"):
         if counts[i] < _LEAST:
             break
-        rows = np.flatnonzero(view == i)
-        if not np.isfinite(images[rows]).all():
+        points, images = evidence.images(int(i))
+        if not np.isfinite(images).all():
             return False
-        own = X[tracks.point[rows]]
+        own = X[points]
         a = own - own.mean(axis=0)
-        a = np.column_stack([a / max(float(np.abs(a).max()), 1e-300), np.ones(len(rows))])
-        off = images[rows] - a @ np.linalg.lstsq(a, images[rows], rcond=None)[0]
+        a = np.column_stack([a / max(float(np.abs(a).max()), 1e-300), np.ones(len(a))])
+        off = images - a @ np.linalg.lstsq(a, images, rcond=None)[0]
         if float(np.mean(off**2)) > noise_px**2:
             return False
         asked += 1

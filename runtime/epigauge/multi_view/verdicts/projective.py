@@ -20,7 +20,7 @@ from epigauge.multi_view.verdicts.counting import (
     missing_by_count,
 )
 from epigauge.multi_view.verdicts.front import BEHIND, behind
-from epigauge.multi_view.verdicts.gross import gross_flags
+from epigauge.multi_view.verdicts.gross import TailOfArrays, gross_flags
 from epigauge.multi_view.verdicts.network import why_open
 from epigauge.multi_view.verdicts.perspective import affine_pairs
 from epigauge.multi_view.verdicts.rank import open_directions, suits
@@ -121,7 +121,7 @@ def judged(
     if judge and not raised and affine_pairs(seen, images, noise_px):
         raised.add("near-affine")
     if bends:
-        raised.update(gross_flags(distances, noise_px, seen.xy))
+        raised.update(gross_flags(TailOfArrays(distances, seen.xy), noise_px))
     if of_cameras or of_points > _OPEN * seen.m:
         raised.update(("undetermined", *why_open(tracks, rejected)))
     elif of_points or deviation > _WEAK:
