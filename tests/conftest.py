@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from clusters import cluster
 
 #: The image pairs of the data directory's folder ``pairs``.
 PAIRS = (
@@ -53,6 +56,16 @@ def data_dir() -> Path:
     if not (directory / "pairs").is_dir():
         pytest.skip("no measured data: set EPIGAUGE_DATA to the directory that holds pairs/")
     return directory
+
+
+@pytest.fixture(scope="session")
+def client() -> Iterator[Any]:
+    """Give the client of two processes, the same for all tests; skip without Dask."""
+    distributed = pytest.importorskip("distributed")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with cluster(2) as two, distributed.Client(two, set_as_default=False) as found:
+            yield found
 
 
 @pytest.fixture(params=PAIRS)

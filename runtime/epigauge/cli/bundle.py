@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -25,6 +25,7 @@ from epigauge._options import (
     Method,
 )
 from epigauge._options import Repeated as _Repeated
+from epigauge.cli._cluster import adjuster
 from epigauge.cli._common import (
     DONE,
     INTERRUPTED,
@@ -39,6 +40,7 @@ from epigauge.cli._common import (
     write_json,
 )
 from epigauge.cli._live import watching
+from epigauge.cli._parts import adjust_folder, refuse
 from epigauge.cli._scenes import (
     FixView,
     Refine,
@@ -49,7 +51,8 @@ from epigauge.cli._scenes import (
 )
 from epigauge.cli._tables import save_residuals
 from epigauge.cli._targets import ImageSize, Plot, Targets, outputs
-from epigauge.errors import ArgumentError, FileFormatError, MissingPackageError
+from epigauge.distributed.parts import is_parts
+from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import (
     TrackFile,
     load_reconstruction,
@@ -66,9 +69,6 @@ from epigauge.verdicts import explained, usable
 
 #: Tracks in these files have y down, those of BAL problems y up.
 _Y_DOWN = (".npz", ".csv")
-
-#: Seconds within which a scheduler answers.
-_ANSWERS = 10
 
 Clean = Annotated[bool, typer.Option("--clean", help="Use only what the file marks as clean.")]
 MaxIter = Annotated[int, typer.Option(help="Trial steps allowed.")]
@@ -88,7 +88,7 @@ Start = Annotated[Path | None, typer.Option(help="NPZ or BAL with cameras and po
 TracksFile = Annotated[
     Path,
     typer.Argument(
-        help="NPZ, CSV (view, point, x, y), BAL (.txt, .bz2), or a COLMAP folder.",
+        help="NPZ, CSV (view, point, x, y), BAL (.txt, .bz2), a COLMAP folder, or one of parts.",
         show_default=False,
     ),
 ]
@@ -157,6 +157,15 @@ def bundle(
             show_default=False,
         ),
     ] = None,
+    memory_limit: Annotated[
+        int | None,
+        typer.Option(
+            metavar="MB",
+            min=0,
+            help="Of a folder of parts: what each worker keeps of observations.",
+            show_default=False,
+        ),
+    ] = None,
     json: Json = False,
 ) -> int:
     """Adjust the cameras and points of a file of tracks, or of a scene.
@@ -172,6 +181,11 @@ def bundle(
     a BAL file with --image-size), .txt or .txt.bz2 (BAL) too; stdout has R | t
     row by row and the parameters of each view.
 
+    A folder of parts, as eg.distributed.write_parts writes it, is adjusted by
+    the workers of --scheduler or, without, by processes of this machine, none
+    of which holds all observations. -o takes a new folder, for parts with the
+    result.
+
     Else pictures, PLY and COLMAP models use a basis in which the scene looks
     plausible: that is no calibration, and nothing can be measured in it.
 
@@ -179,6 +193,15 @@ def bundle(
     reported and saved as asked, with exit code 130.
     """
     tracks = given(tracks)
+    if is_parts(tracks):
+        refuse({"gauge": gauge, "start": start, "colmap": colmap, "clean": clean, "prune": prune})
+        refuse({"damping": damping, "robust": robust, "plot": plot, "precision": precision})
+        refuse({"method": method != "covariant", "image_size": image_size})
+        known: dict[str, Any] = {"loss": loss, "max_iter": max_iter, "backend": backend}
+        where = scheduler, memory_limit
+        return adjust_folder(tracks, *where, refine, fix_view or [], output or [], json, **known)
+    if memory_limit is not None:
+        raise ArgumentError("--memory-limit", "is given without parts", "a folder of parts")
     if refine is not None or image_size is not None or is_scene(tracks):
         others = {"gauge": gauge, "start": start, "colmap": colmap, "clean": clean or None}
         asked: dict[str, Any] = {
@@ -235,28 +258,6 @@ def bundle(
     if refused is not None:
         raise refused
     return DONE if result.success else NOT_CONVERGED
-
-
-def adjuster(scheduler: str | None) -> Callable[..., eg.BundleResult]:
-    """Return what adjusts: here, or the workers of the Dask scheduler at an address."""
-    if scheduler is None:
-        return eg.bundle_adjust
-    try:
-        from distributed import Client
-    except ImportError:
-        raise MissingPackageError("distributed", "dask") from None
-    try:
-        client = Client(scheduler, timeout=_ANSWERS, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        was = f"{scheduler!r:.80} does not answer ({error!s:.200})"
-        needed = "the address of a running scheduler, such as tcp://host:8786"
-        raise ArgumentError("--scheduler", was, needed) from None
-
-    def adjust(tracks: eg.Tracks, start: Any, **options: Any) -> eg.BundleResult:
-        with client:
-            return eg.distributed.bundle_adjust(tracks, client, start, **options)
-
-    return adjust
 
 
 def first_reconstruction(

@@ -4,5 +4,7 @@ The processes are those of a client: ``pip install "epigauge[dask]"``.
 """
 
 from epigauge.distributed.adjust import bundle_adjust
+from epigauge.distributed.parts_adjust import PartsResult
+from epigauge.distributed.write_parts import Chunk, write_parts
 
-__all__ = ["bundle_adjust"]
+__all__ = ["Chunk", "PartsResult", "bundle_adjust", "write_parts"]

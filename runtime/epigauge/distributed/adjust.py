@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import os
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +14,10 @@ from epigauge.bundle.ties import Ties
 from epigauge.cameras import AnyReconstruction, CameraModel
 from epigauge.distributed.dispatch import Dispatch
 from epigauge.distributed.linearizer import DistributedLinearizer
+from epigauge.distributed.parts_adjust import PartsResult, adjust_parts
 from epigauge.distributed.pieces import cut
 from epigauge.errors import ArgumentError
+from epigauge.io._common import PathLike
 from epigauge.kernels import Table
 from epigauge.multi_view.adjust import BundleResult
 from epigauge.multi_view.adjust import bundle_adjust as adjust_here
@@ -63,6 +66,7 @@ class Workers:
         self._dispatch.sweep()
 
 
+@overload
 def bundle_adjust(
     source: Tracks,
     client: Any,
@@ -71,7 +75,33 @@ def bundle_adjust(
     partitions: int | None = None,
     solver: str = "auto",
     **options: Any,
-) -> BundleResult:
+) -> BundleResult: ...
+
+
+@overload
+def bundle_adjust(
+    source: PathLike,
+    client: Any,
+    start: AnyReconstruction | None = None,
+    *,
+    solver: str = "auto",
+    memory_limit: int | None = None,
+    output: PathLike | None = None,
+    **options: Any,
+) -> PartsResult: ...
+
+
+def bundle_adjust(
+    source: Tracks | PathLike,
+    client: Any,
+    start: AnyReconstruction | None = None,
+    *,
+    partitions: int | None = None,
+    solver: str = "auto",
+    memory_limit: int | None = None,
+    output: PathLike | None = None,
+    **options: Any,
+) -> BundleResult | PartsResult:
     """Minimise the reprojection error of cameras and points by the workers of a Dask cluster.
 
     Points are partitioned. Each worker builds its partitions once and keeps their points from step
@@ -81,32 +111,44 @@ def bundle_adjust(
 
     Parameters
     ----------
-    source : Tracks
-        Observations.
+    source : Tracks, str or path
+        Observations, or a folder of parts that `write_parts` has written: then no process holds
+        all of them, and the client only cameras and points.
     client : distributed.Client
         Connected to a scheduler with workers that have the same epigauge installed, and that can be
         reached from here.
     start : Reconstruction, MetricReconstruction or AffineReconstruction, optional
-        As in `epigauge.bundle_adjust`.
+        As in `epigauge.bundle_adjust`. Of a folder those in it by default, always calibrated ones.
     partitions : int, optional
         How many partitions; by default one for each 250,000 observations, but at least 8. Another
-        number gives a result that differs by rounding.
+        number gives a result that differs by rounding. Those of a folder are its parts.
     solver : {"auto", "factor", "cg"}
         How the reduced system is solved: by a factor, computed here, or by conjugate gradients,
         whose products the workers compute. By default the first, unless it fills too much.
+    memory_limit : int, optional
+        Of a folder: bytes of observations that each worker holds from call to call. What is beyond
+        is read anew, one partition at a time, whenever it is needed; by default nothing is. An
+        observation takes about 90 bytes, a point 270.
+    output : str or path, optional
+        Of a folder: another one, new or empty, to write the result to, of the same form.
     **options
-        All those of `epigauge.bundle_adjust` but `workers` and `lines`.
+        All those of `epigauge.bundle_adjust` but `workers` and `lines`. Of a folder `refine`,
+        `fixed_views`, `fixed_points`, `embedded`, `schedule`, `loss`, `loss_scale_px`, `ftol`,
+        `xtol`, `gtol`, `max_iter`, `backend` and `callback`.
 
     Returns
     -------
-    BundleResult
-        As of `epigauge.bundle_adjust`, which it equals but for rounding.
+    BundleResult or PartsResult
+        As of `epigauge.bundle_adjust`, which it equals but for rounding; of a folder without
+        residuals, which would be as many as the observations.
 
     Raises
     ------
     ArgumentError
         If the client is none, has lost its scheduler or has no workers, if one partition loses
         worker after worker, and as of `epigauge.bundle_adjust`.
+    FileFormatError
+        Naming a file of the folder that is missing, cut short, changed, or of another scene.
 
     Notes
     -----
@@ -128,6 +170,24 @@ def bundle_adjust(
     if options.get("lines") is not None:
         needed = "none: eg.bundle_adjust adjusts lines in one process"
         raise ArgumentError("lines", "is given beside a client", needed)
+    if not isinstance(source, Tracks):
+        if not isinstance(source, str | os.PathLike):
+            was = f"is a {type(source).__name__}"
+            raise ArgumentError("source", was, "eg.Tracks(...), or a folder of write_parts")
+        if partitions is not None:
+            was = "is given with a folder of parts"
+            raise ArgumentError("partitions", was, "none: each part is one")
+        if memory_limit is not None:
+            memory_limit = as_count("memory_limit", memory_limit, at_least=0)
+        dispatch = Dispatch(client, memory_limit)
+        given: Any = start
+        try:
+            return adjust_parts(source, dispatch, given, solver=solver, output=output, **options)
+        finally:
+            dispatch.sweep()
+    for name, value in (("memory_limit", memory_limit), ("output", output)):
+        if value is not None:
+            raise ArgumentError(name, "is given with tracks", "none, or a folder of write_parts")
     workers = Workers(client, partitions, solver)
     try:
         there: Any = workers

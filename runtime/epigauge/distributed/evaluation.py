@@ -12,10 +12,10 @@ from epigauge import kernels
 from epigauge.bundle.linearizer import Linearizer, Normal, PointRefinement
 from epigauge.bundle.native_linearizer import NativeCoupling, NativeLinearizer
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
-from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.skyline import Skyline
 from epigauge.cameras import camera_model
 from epigauge.distributed.observations import Observations, Setup
+from epigauge.distributed.questions import NETWORK, OF_FIT
 from epigauge.distributed.sums import Rows, Terms
 
 __all__ = ["Evaluation"]
@@ -45,21 +45,24 @@ class Evaluation:
         #: Numbers of the views in the order of the reduced system, and the caller's.
         self.numbers, graph = observations.graph(number)
         self.views = np.argsort(number, kind="stable")[self.numbers]
-        self._order = observations.rows(number)
-        self.linearizer = self._made(observations, graph)
+        self._order = rows = observations.rows(number)
+        white = observations.whitening
+        #: The graph of these views and of the points; measurements, sorted by it.
+        self.graph, self.q = graph, np.ascontiguousarray(observations.q[:, rows])
+        self.weights = observations.weights[rows]
+        self.whitening = None if white is None else np.ascontiguousarray(white[..., rows])
+        self.linearizer = self._made()
 
-    def _made(self, own: Observations, graph: ObservationGraph) -> Linearizer:
-        setup, rows = self.setup, self._order
-        table, q = kernels.table(setup.backend), np.ascontiguousarray(own.q[:, rows])
-        weights, heaviest = own.weights[rows], setup.heaviest
-        if not (table.compiled and own.whitening is None):
-            whitening = None if own.whitening is None else own.whitening[..., rows]
-            parts = self.model, table, graph, q, weights, setup.loss, whitening, heaviest
+    def _made(self) -> Linearizer:
+        setup, table = self.setup, kernels.table(self.setup.backend)
+        graph, q, weights, heaviest = self.graph, self.q, self.weights, setup.heaviest
+        if not (table.compiled and self.whitening is None):
+            parts = self.model, table, graph, q, weights, setup.loss, self.whitening, heaviest
             return NumpyLinearizer(*parts)
         made = NativeLinearizer(
             *(self.model, graph, q, weights, setup.loss), columns=setup.used, heaviest=heaviest
         )
-        made.layout.settle(Skyline.of(graph.lowest))
+        made.layout.settle(Skyline.of(self.graph.lowest))
         return made
 
     @cached_property
@@ -82,6 +85,16 @@ class Evaluation:
     def rows(self, own: Array) -> Rows:
         """Return rows of the partition's views in the order of the reduced system."""
         return Rows(self.numbers, own)
+
+    def asked(
+        self, question: str, cameras: Array, arguments: tuple[Any, ...], points: Array
+    ) -> tuple[Terms, Any]:
+        """Return the answer to a question about how an estimate fits."""
+        return (), OF_FIT[question](self, cameras, points, *arguments)
+
+    def network(self, question: str, arguments: tuple[Any, ...]) -> tuple[Terms, Any]:
+        """Return the answer to a question about what sees what."""
+        return (), NETWORK[question](self, *arguments)
 
     def residuals(self, cameras: Array, points: Array) -> tuple[Terms, Array]:
         """Return the partition's own residuals, (N, 2), in the order of `Observations`."""

@@ -163,7 +163,7 @@ def _read_header(
     )
 
 
-def write_npz(file: IO[bytes], arrays: Mapping[str, ArrayLike]) -> None:
+def write_npz(file: IO[bytes], arrays: Mapping[str, ArrayLike], *, compressed: bool = True) -> None:
     """Write arrays as `numpy.savez_compressed` does, but let an interruption through.
 
     On the way out NumPy closes the archive also where Ctrl-C came in the middle of an array: then
@@ -175,8 +175,10 @@ def write_npz(file: IO[bytes], arrays: Mapping[str, ArrayLike]) -> None:
         Where to write to; what was written of it is useless after an exception.
     arrays : mapping of str to array_like
         No objects.
+    compressed : bool
+        Smaller, and ten times slower to write.
     """
-    archive = zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED)
+    archive = zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED)
     try:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:

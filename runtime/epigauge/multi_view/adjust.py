@@ -41,7 +41,7 @@ from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
 
 __all__ = ["BundleResult", "bundle_adjust"]
 
-_SCHEDULES: dict[str, Callable[[], lm.Schedule]] = {
+SCHEDULES: dict[str, Callable[[], lm.Schedule]] = {
     "classic": lm.Classic,
     "nielsen": lm.Nielsen,
     "adaptive": lm.Adaptive,
@@ -233,7 +233,7 @@ def bundle_adjust(
         return without_gross_errors(partial(bundle_adjust, **options), tracks, start, table, last)
     as_choice("method", method, STRATEGIES)
     as_choice("gauge_mode", gauge_mode, ("explicit", "implicit"))
-    as_choice("schedule", schedule, ("auto", *_SCHEDULES))
+    as_choice("schedule", schedule, ("auto", *SCHEDULES))
     as_choice("loss", loss, LOSSES)
     if damping is not None:
         as_choice("damping", damping, DAMPINGS)
@@ -253,7 +253,7 @@ def bundle_adjust(
             lines,
             method=method,
             damping=damping,
-            schedule=_SCHEDULES["adaptive" if schedule == "auto" else schedule],
+            schedule=SCHEDULES["adaptive" if schedule == "auto" else schedule],
             loss=loss,
             loss_scale_px=loss_scale_px,
             stopping=stopping,
@@ -307,7 +307,7 @@ def bundle_adjust(
         gauge_mode=gauge_mode,
         damping=damping,
         embedded=embedded,
-        schedule=_SCHEDULES[rule],
+        schedule=SCHEDULES[rule],
         loss=Loss(loss, scale_px / job.scale_px),
         stopping=stopping,
         workers=workers,

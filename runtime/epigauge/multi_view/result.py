@@ -20,7 +20,7 @@ from epigauge.verdicts import FLAGS, usable
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["BundleResult"]
+__all__ = ["BundleResult", "told"]
 
 Array = NDArray[np.float64]
 
@@ -141,7 +141,7 @@ class BundleResult(Result):
         with waiting:  # threads would write to the same normal equations
             judge = self.__dict__.get("_judge")
             if judge is not None:
-                self.__dict__.update(_told(judge(), self.status))
+                self.__dict__.update(told(judge(), self.status))
                 del self.__dict__["_judge"]
 
     if not TYPE_CHECKING:  # to a type checker all fields are there
@@ -196,7 +196,7 @@ class BundleResult(Result):
         return plot_bundle(self, tracks, title, **options)
 
 
-def _told(verdict: Verdict, status: int) -> dict[str, Any]:
+def told(verdict: Verdict, status: int) -> dict[str, Any]:
     """Return the fields that are a matter of a verdict."""
     return {
         "flags": verdict.flags,

@@ -12,7 +12,7 @@ import numpy as np
 from epigauge_generated.numpy_backend import losses
 from numpy.typing import NDArray
 
-__all__ = ["EFFICIENT", "LOSSES", "Loss", "Mixture", "median", "robust_scale"]
+__all__ = ["EFFICIENT", "LOSSES", "Loss", "Mixture", "median", "robust_scale", "scale_of_median"]
 
 Array = NDArray[np.float64]
 _Values = tuple[Array, Array, Array]
@@ -122,4 +122,9 @@ def robust_scale(d: Array) -> float:
     ----------
     .. [1] P. J. Rousseeuw, A. M. Leroy, "Robust regression and outlier detection", 1987, ch. 5.
     """
-    return float(1.4826 * (1.0 + 5.0 / max(len(d) - 7, 1)) * median(np.abs(d)))
+    return scale_of_median(median(np.abs(d)), len(d))
+
+
+def scale_of_median(found: float, count: int) -> float:
+    """Return what `robust_scale` does, for the median absolute distance of so many."""
+    return float(1.4826 * (1.0 + 5.0 / max(count - 7, 1)) * found)
