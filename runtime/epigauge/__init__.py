@@ -36,11 +36,13 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge.images.tracks import build_tracks
     from epigauge.io import (
         Matches,
+        load_line_tracks,
         load_matches,
         load_reconstruction,
         load_result,
         load_scene,
         load_tracks,
+        save_line_tracks,
         save_matches,
         save_reconstruction,
         save_result,
@@ -146,6 +148,7 @@ __all__ = [
     "kernels",
     "line_scene",
     "load_image",
+    "load_line_tracks",
     "load_matches",
     "load_reconstruction",
     "load_result",
@@ -161,6 +164,7 @@ __all__ = [
     "reprojection_distances",
     "samples",
     "sampson_distances",
+    "save_line_tracks",
     "save_matches",
     "save_reconstruction",
     "save_result",
@@ -182,8 +186,9 @@ _WHERE = {
     "images.pairwise": "PairwiseMatches match_photographs",
     "images.tracks": "build_tracks",
     "io": (
-        "Matches load_matches load_reconstruction load_result load_scene load_tracks "
-        "save_matches save_reconstruction save_result save_scene save_tracks"
+        "Matches load_line_tracks load_matches load_reconstruction load_result load_scene "
+        "load_tracks save_line_tracks save_matches save_reconstruction save_result save_scene "
+        "save_tracks"
     ),
     "kernels": "backend set_backend",
     "line_scenes": "LineScene line_scene",

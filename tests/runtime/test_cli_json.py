@@ -27,6 +27,7 @@ COMMANDS = {
     "pair": "pair A.jpg B.jpg",
     "bundle": "bundle tracks.csv",
     "bundle, scene": "bundle scene.npz",
+    "bundle, lines": "bundle with_lines.npz --lines lines.csv --refine pose",
     "compare": "compare tracks.csv --methods covariant,free",
     "colmap": "colmap database.db",
     "colmap, raw": "colmap database.db --from-matches",
@@ -42,6 +43,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("files")
     documents.provide(path)
     eg.save_scene(path / "scene.npz", *metric_scene("SIMPLE_RADIAL", noise_px=0.3))
+    lines = eg.line_scene(n_views=3, n_points=10, n_lines=5, seed=1)
+    eg.save_scene(path / "with_lines.npz", lines.tracks, lines.true)
+    eg.save_line_tracks(path / "lines.csv", lines.line_tracks)
     return path
 
 

@@ -29,14 +29,16 @@ from epigauge.cli._common import (
     write_json,
 )
 from epigauge.cli._live import watching
-from epigauge.cli._tables import save_residuals
+from epigauge.cli._tables import save_line_residuals, save_residuals
 from epigauge.cli._targets import PICTURES, Targets, check_folder, check_target, save_drawing
 from epigauge.errors import ArgumentError
-from epigauge.io import SceneSource, load_scene, plain, save_ply, save_scene
+from epigauge.io import SceneSource, load_line_tracks, load_scene, plain, save_ply, save_scene
 from epigauge.io._npz_scene import write_npz_scene
+from epigauge.io.line_files import arrays_of_lines
 from epigauge.io.output import arrays_of_result
 from epigauge.io.scene_files import is_scene_file, scene_content
 from epigauge.multi_view.display import Display, display
+from epigauge.multi_view.line_segments import line_pieces
 
 #: Views up to which standard deviations are told unasked, and rows of their table.
 _TOLD, _ROWS = 200, 24
@@ -44,7 +46,7 @@ _TOLD, _ROWS = 200, 24
 #: Points that are the datum of what is told of precision.
 _DATUM = 200
 
-_POINT, _CAMERA = (90, 140, 190), (224, 122, 31)
+_POINT, _CAMERA, _LINE = (90, 140, 190), (224, 122, 31), (42, 111, 151)
 
 Refine = Annotated[
     str | None,
@@ -76,12 +78,19 @@ def save_cloud(
     centres: NDArray[np.float64],
     note: str,
     colours: NDArray[np.uint8] | None = None,
+    pieces: NDArray[np.float64] | None = None,
 ) -> None:
-    """Write points and centres of cameras as a cloud to look at."""
+    """Write points, centres of cameras and pieces of lines (L, 2, 3) as a cloud to look at."""
     own = np.broadcast_to(np.array(_POINT, np.uint8), (len(points), 3))
     cameras = np.broadcast_to(np.array(_CAMERA, np.uint8), (len(centres), 3))
     rgb = np.vstack([own if colours is None else colours, cameras])
-    save_ply(path, np.vstack([points, centres]), rgb, note)
+    places, edges = np.vstack([points, centres]), None
+    if pieces is not None:
+        ends = pieces.reshape(-1, 3)
+        edges = len(places) + np.arange(len(ends)).reshape(-1, 2)
+        rgb = np.vstack([rgb, np.broadcast_to(np.array(_LINE, np.uint8), ends.shape)])
+        places = np.vstack([places, ends])
+    save_ply(path, places, rgb, note, edges)
 
 
 class SceneJob:
@@ -95,16 +104,17 @@ class SceneJob:
         rigs: str = "keep",
         y_up: bool | None = None,
         image_size: tuple[int, int] | None = None,
+        lines: Path | None = None,
     ) -> None:
         self.path, self.rigs, self.image_size = path, rigs, image_size
         self.tracks, self.start = load_scene(path)
         if not isinstance(self.start, eg.MetricReconstruction):
             was = "is given with cameras that are not calibrated"
             raise ArgumentError("--refine", was, "a scene with calibrated ones, or none")
-        if self.start.lines is not None:
+        self.lines = None if lines is None else load_line_tracks(lines, self.tracks)
+        if self.start.lines is not None and lines is None:
             was = f"has {len(self.start.lines)} lines, which would be lost"
-            needed = "one without lines; eg.bundle_adjust(..., lines=...) of Python adjusts them"
-            raise ArgumentError("scene", was, needed)
+            raise ArgumentError("scene", was, "their segments: --lines FILE")
         model = self.start.cameras.model
         if image_size is not None and model != "bal":
             was = f"is given with cameras of the model {model}"
@@ -147,6 +157,8 @@ class SceneJob:
         begin = time.perf_counter()
         with watching(out, len(self.tracks), "adjustment", not json) as watch:
             watch.begin()
+            if self.lines is not None:
+                options["lines"] = self.lines
             result = adjust(
                 self.tracks,
                 self.start,
@@ -184,6 +196,9 @@ class SceneJob:
         check_folder(path)
         if path.suffix.lower() in (".ply", ".csv"):
             return
+        if self.lines is not None and path.suffix.lower() != ".npz":
+            was = f"is {str(path)!r}, a form that has no place for lines"
+            raise ArgumentError("-o", was, "a name ending in .npz, .ply or .csv")
         if self.start.cameras.model == "bal" and not (self.image_size or is_scene_file(path)):
             was = "is not given, and a BAL file does not tell it"
             raise ArgumentError("--image-size", was, "the images' width and height, or -o FILE.npz")
@@ -220,6 +235,7 @@ class _SceneAnswer:
                 eg.gauge.inner(points=most[self.frame.shown[most]].tolist()),
                 refine=self.job.refine,
                 fixed_views=self.job.fixed,
+                lines=self.job.lines,
                 loss=self.loss,
                 loss_scale_px=result.loss_scale_px or "auto",
             )
@@ -239,19 +255,26 @@ class _SceneAnswer:
         return self.sure.intrinsic_rows()
 
     @cached_property
+    def pieces(self) -> NDArray[np.float64] | None:
+        """What is seen of each line, (L, 2, 3)."""
+        lines = self.job.lines
+        return None if lines is None else line_pieces(lines, self.scene)
+
+    @cached_property
     def frame(self) -> Display:
         """Where to look at it."""
         return display(self.scene, self.job.tracks, y_up=self.job.y_up)
 
     def more(self) -> dict[str, Any]:
         """Return what neither result nor scene holds."""
-        tracks = self.job.tracks
-        return {
+        tracks, lines = self.job.tracks, self.job.lines
+        known = {
             "source": str(self.job.path),
             "n_views": tracks.n_views,
             "n_points": tracks.n_points,
             "seconds": self.seconds,
         }
+        return known if lines is None else known | {"n_lines": lines.n_lines}
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
@@ -270,12 +293,18 @@ class _SceneAnswer:
         match path.suffix.lower():
             case ".ply":
                 note = "points, cameras orange"
-                save_cloud(path, scene.X, scene.centres, note, tracks.colours)
+                save_cloud(path, scene.X, scene.centres, note, tracks.colours, self.pieces)
             case ".npz":
                 more = arrays_of_result(self.result) | self.more()
+                if self.job.lines is not None:
+                    own = arrays_of_lines(self.job.lines)
+                    more |= {f"line_tracks_{name}": array for name, array in own.items()}
                 write_npz_scene(path, tracks, scene, more)
             case ".csv":
                 save_residuals(path, self.result, tracks)
+                if self.job.lines is not None:
+                    beside = path.with_name(f"{path.stem}.lines.csv")
+                    save_line_residuals(beside, self.result, self.job.lines, tracks)
             case _:
                 save_scene(path, *self.job.written(path, scene), rigs=self.job.rigs)
 
@@ -285,7 +314,7 @@ class _SceneAnswer:
         if path.suffix.lower() == ".html":
             from epigauge.reports import save_viewer
 
-            options: Any = {"frame": self.frame, "covariance": self.sure}
+            options: Any = {"frame": self.frame, "covariance": self.sure, "pieces": self.pieces}
             save_viewer(path, self.result, tracks, title, **options)
             return
         from epigauge.plots import plot_bundle, save_figure
@@ -319,6 +348,12 @@ class _SceneAnswer:
             "flags": escape(", ".join(result.flags)) or "none",
             "seconds": f"{self.seconds:.2f}",
         }
+        if self.job.lines is not None and result.line_fun is not None:
+            rms = float(np.sqrt(np.mean(result.line_fun**2)))
+            rows["lines"] = (
+                f"{self.job.lines.n_lines}, {len(self.job.lines)} segments, {rms:.6g} RMS of their "
+                "end points' distances over sigma"
+            )
         if result.n_behind:
             rows["behind"] = f"{result.n_behind} observations of points behind their camera"
         if result.weakest:

@@ -149,6 +149,14 @@ def bundle(
     fix_view: FixView = None,
     rigs: Rigs = "keep",
     image_size: ImageSize = None,
+    lines: Annotated[
+        Path | None,
+        typer.Option(
+            help="Of a scene: segments of lines to adjust with the points: CSV with view, line, "
+            "x1, y1, x2, y2 and, if you like, sigma; or NPZ.",
+            show_default=False,
+        ),
+    ] = None,
     scheduler: Annotated[
         str | None,
         typer.Option(
@@ -179,7 +187,9 @@ def bundle(
     --refine or --image-size, a BAL file: it has calibrated cameras and points
     to begin with, which stay of their model. -o then takes a folder (COLMAP; of
     a BAL file with --image-size), .txt or .txt.bz2 (BAL) too; stdout has R | t
-    row by row and the parameters of each view.
+    row by row and the parameters of each view. With --lines, lines are adjusted
+    together with the points; NPZ, PLY (as edges), CSV (residuals of segments in
+    NAME.lines.csv) and pages have them, other forms no place for them.
 
     A folder of parts, as eg.distributed.write_parts writes it, is adjusted by
     the workers of --scheduler or, without, by processes of this machine, none
@@ -213,11 +223,12 @@ def bundle(
         asked |= {"backend": backend, "gauge_mode": gauge_mode, "robust": robust}
         refuse_options(others)
         asked["adjust"] = adjuster(scheduler)
-        scene = SceneJob(tracks, refine, fix_view or [], rigs, y_up, image_size)
+        scene = SceneJob(tracks, refine, fix_view or [], rigs, y_up, image_size, lines)
         return scene.run(asked, plot, output, json, precision)
-    if precision is not None:
-        was = "is given with tracks, whose cameras are not calibrated"
-        raise ArgumentError("--precision", was, "a scene")
+    for option, value in {"--precision": precision, "--lines": lines}.items():
+        if value is not None:
+            was = "is given with tracks, whose cameras are not calibrated"
+            raise ArgumentError(option, was, "a scene")
     targets = Targets(plot, output, (".npz", ".ply", ".csv"), json=json)
     out = console()
     file = load_track_file(tracks, clean, prune=repeated if prune else None)

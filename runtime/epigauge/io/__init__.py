@@ -11,6 +11,7 @@ from __future__ import annotations
 from epigauge.io._colmap_pinhole import save_colmap_model
 from epigauge.io._common import MAX_MATCHES
 from epigauge.io._scene import ColmapSource, SceneSource
+from epigauge.io.line_files import load_line_tracks, save_line_tracks
 from epigauge.io.matches import Matches, load_matches, save_matches
 from epigauge.io.output import plain, save_result, writing
 from epigauge.io.ply import save_ply
@@ -31,6 +32,7 @@ __all__ = [
     "Matches",
     "SceneSource",
     "TrackFile",
+    "load_line_tracks",
     "load_matches",
     "load_reconstruction",
     "load_result",
@@ -39,6 +41,7 @@ __all__ = [
     "load_tracks",
     "plain",
     "save_colmap_model",
+    "save_line_tracks",
     "save_matches",
     "save_ply",
     "save_reconstruction",

@@ -54,7 +54,11 @@ class Columns:
 
 
 def read_text(
-    path: Path, file: IO[bytes], columns: Columns, flag: str | None = None
+    path: Path,
+    file: IO[bytes],
+    columns: Columns,
+    flag: str | None = None,
+    rows: list[int] | None = None,
 ) -> dict[str, Any]:
     """Read the columns of a text file.
 
@@ -68,6 +72,8 @@ def read_text(
         What it can hold.
     flag : str, optional
         The one column of marks to read.
+    rows : list of int, optional
+        Gets the number of each row's line in the file, for messages.
 
     Returns
     -------
@@ -118,6 +124,8 @@ def read_text(
         for name, value in zip(columns.indices, row, strict=False):
             _check_index(path, name, value, line)
         values.extend(row)
+        if rows is not None:
+            rows.append(line)
         if flag_at is not None:
             flags.append(_flag(path, names[flag_at], fields[flag_at], line))
     if not values:

@@ -9,6 +9,7 @@ from epigauge.io._common import PathLike, check_suffix
 from epigauge.io.output import writing
 
 _VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
+_EDGE = np.dtype([("ends", "<i4", 2)])
 _HEADER = """ply
 format binary_little_endian 1.0
 comment {comment}
@@ -19,7 +20,10 @@ property float z
 property uchar red
 property uchar green
 property uchar blue
-end_header
+"""
+_EDGES = """element edge {count}
+property int vertex1
+property int vertex2
 """
 
 
@@ -28,8 +32,9 @@ def save_ply(
     xyz: NDArray[np.float64],
     rgb: NDArray[np.uint8],
     comment: str = "",
+    edges: NDArray[np.intp] | None = None,
 ) -> None:
-    """Write coloured points as binary PLY.
+    """Write coloured points, and edges between some of them, as binary PLY.
 
     Parameters
     ----------
@@ -41,6 +46,8 @@ def save_ply(
         Colours.
     comment : str
         One line for whoever opens the file in an editor.
+    edges : ndarray of int, shape (k, 2), optional
+        Which points are joined.
 
     Raises
     ------
@@ -63,5 +70,11 @@ def save_ply(
     vertices = np.empty(len(xyz), dtype=_VERTEX)
     vertices["xyz"], vertices["rgb"] = xyz, rgb
     with writing(path) as file:
-        file.write(_HEADER.format(comment=comment, count=len(xyz)).encode("ascii"))
+        header = _HEADER.format(comment=comment, count=len(xyz))
+        header += "" if edges is None else _EDGES.format(count=len(edges))
+        file.write(f"{header}end_header\n".encode("ascii"))
         file.write(vertices.tobytes())
+        if edges is not None:
+            rows = np.empty(len(edges), dtype=_EDGE)
+            rows["ends"] = edges
+            file.write(rows.tobytes())

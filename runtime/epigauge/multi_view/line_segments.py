@@ -13,12 +13,15 @@ from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.line_tracks import LineTracks
 
-__all__ = ["segments_of"]
+__all__ = ["line_pieces", "segments_of"]
 
 Array = NDArray[np.float64]
 
 #: Newton steps to a direction without distortion, and pixels that it may be off.
 _STEPS, _MISSED = 30, 1e-6
+
+#: A line of sight along the line meets it nowhere in particular.
+_PARALLEL = 1e-6
 
 
 def segments_of(
@@ -88,3 +91,36 @@ def _inverses(a: Array) -> Array:
     determinant = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
     adjoint = np.array([[a[:, 1, 1], -a[:, 0, 1]], [-a[:, 1, 0], a[:, 0, 0]]]).transpose(2, 0, 1)
     return np.asarray(adjoint / determinant[:, None, None])
+
+
+def line_pieces(lines: LineTracks, reconstruction: MetricReconstruction) -> Array:
+    """Return the ends of the piece of each line that its segments show, (L, 2, 3).
+
+    From each end point's line of sight the nearest place on the line is taken; of the places of all
+    views the middle half of the views decides where the piece begins and ends.
+    """
+    assert reconstruction.lines is not None
+    segments = segments_of(lines, reconstruction)
+    K = reconstruction._calibrations()[segments.view]
+    R, centres = reconstruction.R[segments.view], reconstruction.centres[segments.view]
+    n, v = reconstruction.lines[segments.line, :3], reconstruction.lines[segments.line, 3:]
+    # The place of the line that is nearest to each centre, as seen from there.
+    foot = np.cross(v, n - np.cross(centres, v))
+    places = np.empty((2, len(lines)))
+    for k in (0, 1):
+        xy = np.concatenate([segments.ends[2 * k : 2 * k + 2].T, np.ones((len(lines), 1))], axis=1)
+        d = np.einsum("nji,nj->ni", R, np.linalg.solve(K, xy[:, :, None])[:, :, 0])
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        along = np.sum(d * v, axis=1)
+        across = np.maximum(1.0 - along**2, _PARALLEL)
+        places[k] = along * np.sum(d * foot, axis=1) / across
+    # From the foot of each centre to one origin of the line.
+    first = np.searchsorted(segments.line, np.arange(lines.n_lines + 1))
+    origin = np.cross(v, n)
+    places += np.sum((centres + foot - origin) * v, axis=1)
+    low, high = np.sort(places, axis=0)
+    found = np.empty((lines.n_lines, 2, 3))
+    for j, (begin, end) in enumerate(zip(first[:-1], first[1:], strict=True)):
+        s = np.quantile(low[begin:end], 0.25), np.quantile(high[begin:end], 0.75)
+        found[j] = origin[begin] + np.multiply.outer(s, v[begin])
+    return found

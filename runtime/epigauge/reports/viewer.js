@@ -217,6 +217,7 @@ function start() {
     if (by("path").checked) strokes(PATH, 1.2, () => {
       for (let k = 1; k < data.cameras.length; k++) line(project, data.cameras[k - 1].centre, data.cameras[k].centre);
     });
+    if (by("lines").checked) strokes(SEEN, 1.4, () => { for (const ends of data.lines) line(project, ends.slice(0, 3), ends.slice(3)); });
     if (by("cameras").checked && by("pictures").checked) paintPictures(project);
     if (by("cameras").checked) strokes(CAMERA, 1.2, () => { for (const camera of data.cameras) pyramid(project, camera); });
     if (data.spread && by("ellipsoids").checked) paintEllipsoids(project);
@@ -463,7 +464,7 @@ function start() {
     draw();
   });
 
-  for (const id of ["cameras", "pictures", "path", "grid", "ellipsoids"]) by(id).addEventListener("change", draw);
+  for (const id of ["cameras", "pictures", "lines", "path", "grid", "ellipsoids"]) by(id).addEventListener("change", draw);
   for (const id of ["size", "scale", "magnify"]) by(id).addEventListener("input", draw);
   by("colour").addEventListener("change", colour);
   by("reset").addEventListener("click", () => turn(home.yaw, home.pitch));
@@ -472,6 +473,7 @@ function start() {
   by("side").addEventListener("click", () => turn(-Math.PI / 2, 0));
 
   by("path").checked = data.sequence;
+  by("edges").style.display = data.lines.length ? "" : "none";
   by("photos").style.display = pictures.length ? "" : "none";
   by("sure").style.display = data.spread ? "" : "none";
   const resize = () => {
