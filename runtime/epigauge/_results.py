@@ -207,6 +207,13 @@ class SavedResult(dict[str, Any], Result):
         except KeyError:
             raise AttributeError(f"the file holds no {name!r}; it has {', '.join(self)}") from None
 
+    def probability_good(self, px: float) -> Any:
+        """Return what the result of a robust estimate has under this name."""
+        from epigauge.two_view.confidence import probability_below
+
+        found = probability_below(px, *(getattr(self, name) for name in ("error_px", "p_wrong")))
+        return found if found.ndim else float(found)
+
     def __str__(self) -> str:
         return self.summary()
 

@@ -72,3 +72,10 @@ def test_sequences(tmp_path: Path) -> None:
     run("sequences.py", "--quick", "--json", tmp_path / "found.json")
     for own in json.loads((tmp_path / "found.json").read_text()).values():
         assert own["nfev"] <= 25
+
+
+def test_confidence() -> None:
+    pytest.importorskip("scipy", reason="the constants are fitted by SciPy")
+    printed = run("confidence.py", "--trials", 12)
+    assert "| simulated, all kinds | 12 |" in printed
+    assert "Fitted to all:" in printed

@@ -25,6 +25,7 @@ pytest.importorskip("matplotlib", reason="pictures need matplotlib")
 from epigauge.plots import plot_pair, save_figure
 from epigauge.plots.pair_view import reduced
 from epigauge.reports import save_pair_report
+from epigauge.two_view.confidence import Signs
 from matplotlib.collections import PathCollection
 from matplotlib.patches import Ellipse
 
@@ -44,7 +45,9 @@ def found(
     refined = eg.refine_fundamental(x1[used], x2[used], noise_px=None)
     values = {entry.name: getattr(refined, entry.name) for entry in dataclasses.fields(refined)}
     marks = {"inlier": np.arange(60) < 60 - outliers, "used": used}
-    result = RobustResult(**values, **marks, threshold_px=2.0, rounds=3, start="8point")
+    how = {"threshold_px": 2.0, "rounds": 3, "start": "8point"}
+    error = {"error_px": 0.2, "p_wrong": 0.01, "_signs": Signs(0.1, 150.0, -40.0)}
+    result = RobustResult(**values, **marks, **how, **error)
     size = (800, 600)
     return result, ImageMatches(x1, x2, None, size, size, name, "sift", 100, 90)
 

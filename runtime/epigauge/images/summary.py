@@ -8,9 +8,11 @@ import numpy as np
 
 from epigauge import verdicts
 from epigauge.images.matching import ImageMatches
+from epigauge.two_view.confidence import error_text
+from epigauge.two_view.homography_result import HomographyResult
 from epigauge.two_view.robust import RobustResult
 
-__all__ = ["epipole_text", "explained", "inside", "summary", "with_deviation"]
+__all__ = ["epipole_text", "explained", "inside", "match_rows", "summary", "with_deviation"]
 
 
 def summary(
@@ -32,13 +34,11 @@ def summary(
     dict
         Plain text by name, in the order to show it.
     """
-    inliers = int(np.count_nonzero(result.inlier))
     rounds = f", in the last of {result.rounds} rounds" if result.rounds > 1 else ""
-    rows = {
-        "features": f"{matches.n_features1} and {matches.n_features2}, {matches.detector}",
-        "matches": f"{len(matches)}, {inliers} of them inliers within {result.threshold_px:.3g} px",
+    rows = match_rows(matches, result) | {
         "RMS": f"{result.rms_px:.4g} px per coordinate; noise {result.noise_px:.3g} px",
         "sigma": with_deviation(result.sigma, result.sigma_std),
+        "error": error_text(result.error_px, result.p_wrong),
         "epipole 1": epipole_text(result, matches, 1),
         "epipole 2": epipole_text(result, matches, 2),
         "evaluations": f"{result.nfev}, with {result.njev} linearisations{rounds}",
@@ -48,10 +48,24 @@ def summary(
     return rows
 
 
+def match_rows(
+    matches: ImageMatches, result: RobustResult | HomographyResult | None
+) -> dict[str, str]:
+    """Return how many matches there are and how many agree, of whatever model."""
+    rows = {
+        "features": f"{matches.n_features1} and {matches.n_features2}, {matches.detector}",
+        "matches": f"{len(matches)}",
+    }
+    if result is not None:
+        inliers = int(np.count_nonzero(result.inlier))
+        rows["matches"] += f", {inliers} of them inliers within {result.threshold_px:.3g} px"
+    return rows
+
+
 def explained(result: RobustResult) -> dict[str, str]:
     """Return what the matches do not support: each flag of a result with a sentence."""
     found = verdicts.explained(result.flags)
-    if result.rank < 7:
+    if result.rank < 7 and result.E is None:
         found["rank"] = f"The matches determine only {result.rank} of the 7 directions of F."
     if result.status <= 0:
         found["not converged"] = _sentence(result.message)

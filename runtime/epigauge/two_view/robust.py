@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
+from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any, ClassVar, Literal, NamedTuple, Unpack
 
@@ -19,14 +19,17 @@ from epigauge.errors import ArgumentError
 from epigauge.two_view import quick
 from epigauge.two_view.chance import chance_agreement
 from epigauge.two_view.conditioning import condition
+from epigauge.two_view.confidence import Confidence, Signs, probability_below
 from epigauge.two_view.consensus import RANGE, WIDEST, Agreement, Consensus
 from epigauge.two_view.copies import earliest
 from epigauge.two_view.covariance import untruncated
 from epigauge.two_view.essential_consensus import EssentialConsensus
+from epigauge.two_view.evidence import Evidence
 from epigauge.two_view.front_ends import checked, start
 from epigauge.two_view.losses import robust_scale
 from epigauge.two_view.refine import calibrations, refine_fundamental
 from epigauge.two_view.result import FundamentalResult
+from epigauge.two_view.suspicion import log10_alarms
 from epigauge.verdicts import ordered
 
 __all__ = ["Estimate", "RobustResult", "estimate_fundamental", "estimated", "of_matches"]
@@ -62,6 +65,11 @@ class RobustResult(FundamentalResult):
     start : str
         Front end that gave the start: "native", "poselib", "opencv", or "8point" where it found
         nothing.
+    error_px : float
+        Half of the geometries found from such matches have a median error below, if they are that
+        of the scene: the median distance of true matches to their epipolar lines.
+    p_wrong : float
+        Probability that the matches agree on another geometry than that of the scene.
 
     Examples
     --------
@@ -75,7 +83,7 @@ class RobustResult(FundamentalResult):
 
     _shown: ClassVar[tuple[str, ...]] = (
         *("F", "inliers", "threshold_px", "sigma", "rms_px", "noise_px", "rank", "condition"),
-        *("E", "R", "t", "in_front", "start", "message"),
+        *("E", "R", "t", "in_front", "error_px", "p_wrong", "start", "message"),
     )
 
     inlier: Mask = field(repr=False)
@@ -83,6 +91,39 @@ class RobustResult(FundamentalResult):
     threshold_px: float
     rounds: int
     start: str
+    error_px: float
+    p_wrong: float
+    _signs: Signs = field(repr=False)
+
+    def probability_good(self, px: float) -> float:
+        """Return the probability that the median error is below so many pixels.
+
+        Parameters
+        ----------
+        px : float
+            Bound of the median distance of true matches to their epipolar lines, mean of both
+            images.
+
+        Returns
+        -------
+        float
+            How often that is so among all estimates that are given this probability, on pairs whose
+            true geometry is known.
+
+        Raises
+        ------
+        ArgumentError
+            If `px` is not above 0.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.two_view_scene(n_points=300, noise_px=0.5, seed=1)
+        >>> result = eg.estimate_fundamental(scene.x1, scene.x2)
+        >>> result.probability_good(0.05) < 0.1, result.probability_good(1.0) > 0.9
+        (True, True)
+        """
+        return float(probability_below(px, self.error_px, self.p_wrong))
 
     def __iter__(self) -> Iterator[Array | Mask]:
         """Unpack as in OpenCV: ``F, mask = eg.estimate_fundamental(x1, x2)``."""
@@ -255,12 +296,22 @@ def estimated(
     weights = of_matches(options, len(x1), rows).get("weights")
     raw = _Raw(y1, y2, np.ones(len(y1)) if weights is None else np.asarray(weights, float))
 
-    def judged() -> SimpleNamespace:
+    @cache
+    def near() -> tuple[Agreement, float, Mask]:
         agreed, bound = agreement, limit
         if threshold is None:  # real noise has heavier tails than three deviations of its core
             agreed = consensus.judge(agreement.F, agreement.sigma, agreement.share)
             bound = max(limit, _at_most(agreed.mixture.even))
-        agreeing = agreed.inliers(bound)  # where fewer than 8, "no common geometry"
+        return agreed, bound, agreed.inliers(bound)  # where fewer than 8, "no common geometry"
+
+    @cache
+    def among_all() -> Evidence:
+        _, bound, agreeing = near()
+        weights = raw.weights
+        return refined._evidence.among(raw.x1, raw.x2, weights, agreeing, bound * frame.scale)
+
+    def judged() -> SimpleNamespace:
+        agreed, bound, agreeing = near()
         pair = vars(refined).get("_pair")
         if pair is not None and not is_open:  # cheap tests, where they suffice
             flags, success = quick.verdict_of_raw(
@@ -270,20 +321,26 @@ def estimated(
             )
             if flags is not None:
                 return SimpleNamespace(flags=flags, success=success)
-        verdict = _judged(refined, raw, agreeing, bound * frame.scale)
+        verdict = refined.judged(among_all())
         if is_open:
             verdict = SimpleNamespace(
                 flags=ordered((*verdict.flags, "undetermined")), success=False
             )
         return verdict
 
+    @cache
+    def rest() -> SimpleNamespace:
+        return _rest(refined, limit_px if plain else None)
+
+    def confident() -> SimpleNamespace:
+        alarms = log10_alarms(among_all())
+        signs = Signs.of(rest()._uncertainty, y1[used], y2[used], alarms)
+        return SimpleNamespace(_signs=signs, **vars(Confidence.of(signs)))
+
+    later = dict.fromkeys(("flags", "success"), judged)
+    later |= dict.fromkeys(("error_px", "p_wrong", "_signs"), confident)
     return Estimate(
-        RobustResult.partial(
-            known | _cheap(refined),
-            lambda: _rest(refined, limit_px if plain else None),
-            flags=judged,
-            success=judged,
-        ),
+        RobustResult.partial(known | _cheap(refined), rest, **later),
         frame.scale * agreement.signed[copies],
     )
 
@@ -323,13 +380,6 @@ class _Raw:
     x1: Array
     x2: Array
     weights: Array
-
-
-def _judged(
-    refined: FundamentalResult, raw: _Raw, agreeing: Mask, limit_px: float
-) -> SimpleNamespace:
-    """Return flags and success, by all matches: those that agree within a limit, and the others."""
-    return refined.judged(refined._evidence.among(raw.x1, raw.x2, raw.weights, agreeing, limit_px))
 
 
 def _at_least(count: int, agreement: Agreement, limit: float) -> Mask:

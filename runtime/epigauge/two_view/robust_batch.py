@@ -24,6 +24,7 @@ from epigauge.two_view.batch import (
     no_callback,
     threads,
 )
+from epigauge.two_view.confidence import probability_below
 from epigauge.two_view.front_ends import checked
 from epigauge.two_view.robust import RobustResult, estimated
 from epigauge.two_view.tensors import REFUSED
@@ -38,7 +39,7 @@ _PART = 32
 #: Fields with a row a pair: those that a result has when it is made, and with what of it is
 #: computed when it is asked for.
 _NOW = ("F", "sigma", "cost", "rms_px", "threshold_px", "nfev", "njev", "nit", "status")
-_LATER = ("noise_px", "condition", "covariance", "rank")
+_LATER = ("noise_px", "condition", "covariance", "rank", "error_px", "p_wrong")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +56,8 @@ class RobustBatch(FundamentalBatch):
         As given: pair k has the matches ``offsets[k]:offsets[k + 1]``.
     distances : ndarray, shape (m,)
         Signed distances of all matches, wrong ones too.
+    error_px, p_wrong : ndarray, shape (n,)
+        What `probability_good` follows from; infinite and 1 for a pair that was refused.
 
     Examples
     --------
@@ -68,6 +71,16 @@ class RobustBatch(FundamentalBatch):
     inlier: NDArray[np.bool_] = field(repr=False)
     threshold_px: Array
     offsets: NDArray[np.intp] = field(repr=False)
+    error_px: Array
+    p_wrong: Array
+
+    def probability_good(self, px: float) -> Array:
+        """Return the probability of each pair (n,) that its median error is below so many pixels.
+
+        As of `RobustResult`; zero for a pair that was refused.
+        """
+        good = probability_below(px, self.error_px, self.p_wrong)
+        return np.where(self.status == REFUSED, 0.0, good)
 
     def _heading(self) -> str:
         return f"RobustBatch: {len(self)} pairs"
@@ -244,6 +257,8 @@ class _Work:
             condition=np.full(count, np.inf),
             covariance=np.tile(np.diag(np.full(9, np.inf)), (count, 1, 1)),
             rank=np.zeros(count, dtype=np.intp),
+            error_px=np.full(count, np.inf),
+            p_wrong=np.ones(count),
         )
         for k, result in self.results.items():
             for name in _LATER:

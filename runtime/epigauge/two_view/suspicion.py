@@ -6,6 +6,7 @@ geometry that most matches agree on is looked for, as among raw ones.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -32,6 +33,7 @@ __all__ = [
     "is_common",
     "is_inflated",
     "is_suspicious",
+    "log10_alarms",
 ]
 
 Array = NDArray[np.float64]
@@ -93,8 +95,15 @@ def is_inflated(found: Evidence, judged: Evidence) -> bool:
 def is_common(found: Evidence, bar: float = SIGNIFICANT) -> bool:
     """Tell whether more matches agree with F than wrong ones would by chance.
 
-    They would with 10 to the power `bar` geometries at most. Matches in front of one camera only do
-    not agree.
+    They would with 10 to the power `bar` geometries at most.
+    """
+    return log10_alarms(found) <= bar
+
+
+def log10_alarms(found: Evidence) -> float:
+    """Return the logarithm of how many geometries wrong matches would agree with as well.
+
+    Matches in front of one camera only do not agree.
     """
     limit = min(found.limit, CEILING * RANGE) if found.searched else found.limit
     near = found.squared <= limit**2
@@ -102,7 +111,7 @@ def is_common(found: Evidence, bar: float = SIGNIFICANT) -> bool:
         near &= found.in_front
     m, agreed = len(found.inlier), int(np.count_nonzero(near))
     if not agreed:
-        return False
+        return math.inf
     copies = agreed - independent(found.q1[:, near], found.q2[:, near])
     chance = chance_agreement(found.table, found.F, found.all1, found.all2, limit)
-    return log10_false_alarms(m - copies, agreed - copies, chance, found.parameters) <= bar
+    return log10_false_alarms(m - copies, agreed - copies, chance, found.parameters)
