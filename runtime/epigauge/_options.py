@@ -35,6 +35,7 @@ __all__ = [
     "Rigs",
     "Schedule",
     "Structure",
+    "TwoViewModel",
     "known_options",
 ]
 
@@ -48,6 +49,7 @@ PairDamping = Literal["levenberg", "seber"]
 Hessian = Literal["exact", "gauss-newton"]
 Part = Literal["epipole1", "epipole2", "epipolar_transformation"]
 FrontEnd = Literal["auto", "native", "poselib", "opencv"]
+TwoViewModel = Literal["auto", "F", "E", "H"]
 
 Method = Literal[
     "covariant",

@@ -24,7 +24,12 @@ VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)
 COMMANDS = {
     "refine": "refine matches.csv",
     "estimate": "estimate matches.csv",
+    "estimate, E": "estimate matches.csv --model E --intrinsics 1000,640,480",
+    "estimate, H": "estimate matches.csv --model H",
+    "estimate, auto": "estimate matches.csv --model auto",
     "pair": "pair A.jpg B.jpg",
+    "pair, auto": "pair A.jpg B.jpg --model auto",
+    "pair, H": "pair A.jpg B.jpg --model H",
     "bundle": "bundle tracks.csv",
     "bundle, scene": "bundle scene.npz",
     "bundle, lines": "bundle with_lines.npz --lines lines.csv --refine pose",

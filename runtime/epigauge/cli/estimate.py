@@ -9,19 +9,22 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-import epigauge as eg
 from epigauge._options import Backend, FrontEnd
-from epigauge.cli._common import Json, choice, given
+from epigauge.cli._common import Json, choice, given, shown
+from epigauge.cli._models import Intrinsics, Model, check_model, finish_plane, look_for
 from epigauge.cli._targets import ImageSize, Plot, Targets, outputs
 from epigauge.cli.refine import FROM_FILE, finish, of_size, warn_of_marks
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import load_matches
+from epigauge.two_view.confidence import error_text
 
 
 def estimate(
     matches: Annotated[
         Path, typer.Argument(help="CSV, TXT or NPZ: x1, y1, x2, y2 in pixels.", show_default=False)
     ],
+    model: Model = "F",
+    intrinsics: Intrinsics = None,
     robust: Annotated[FrontEnd, choice(FrontEnd, "Robust start.")] = "auto",
     threshold_px: Annotated[
         float | None,
@@ -53,12 +56,11 @@ def estimate(
     Writes F with x2^T F x1 = 0 to stdout, three lines of three numbers; with
     --json everything known about it but the derivatives. A saved NPZ is a file
     of matches too, with the inliers marked: `epigauge refine FILE --inliers`.
+    With --model E or H it is the essential matrix of normalised points, or H
+    with x2 ~ H x1; with --model auto the matrix of the model that the matches
+    support, none where they agree by chance.
     """
     targets = Targets(plot, output, json=json)
-    matches = given(matches)
-    pair = of_size(load_matches(matches, inliers=inliers), image_size)
-    warn_of_marks(pair, "which are judged anew")
-    begin = time.perf_counter()
     options: dict[str, Any] = {
         "robust": robust,
         "threshold_px": "auto" if threshold_px is None else threshold_px,
@@ -67,22 +69,32 @@ def estimate(
         "seed": seed,
         "backend": backend,
     }
-    if pair.weights is not None:
-        options["weights"] = pair.weights
+    cameras = check_model(model, intrinsics, targets, options)
+    matches = given(matches)
+    pair = of_size(load_matches(matches, inliers=inliers), image_size)
+    warn_of_marks(pair, "which are judged anew")
+    begin = time.perf_counter()
     try:
-        result = eg.estimate_fundamental(pair.x1, pair.x2, **options)
+        found = look_for(model, pair.x1, pair.x2, pair.weights, cameras, options)
     except ArgumentError as error:
         if error.argument in FROM_FILE:
             raise FileFormatError(matches, str(error)) from None
         raise
     seconds = time.perf_counter() - begin
-    kept = int(np.count_nonzero(result.inlier))
-    rows = {"matches": f"{len(pair)}, {kept} inliers within {result.threshold_px:.3g} px"}
     more: dict[str, Any] = {
         "source": str(matches),
         "matches": len(pair),
         "noise_estimated": noise_px is None,
+        "seconds": seconds,
+        "x1": pair.x1,
+        "x2": pair.x2,
     }
-    arrays = {"x1": pair.x1, "x2": pair.x2}
-    more |= {"seconds": seconds} | arrays
-    return finish(result, pair, result.used, more, rows, targets, json)
+    rows = {"matches": str(len(pair))}
+    if found.fit is not None:
+        kept = int(np.count_nonzero(found.fit.inlier))
+        rows["matches"] += f", {kept} inliers within {found.fit.threshold_px:.3g} px"
+    result = found.epipolar
+    if result is None:
+        return finish_plane(found, shown(matches), rows, more, targets, json)
+    rows["error"] = error_text(result.error_px, result.p_wrong)
+    return finish(result, pair, result.used, more, rows, targets, json, found)

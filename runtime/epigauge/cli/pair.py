@@ -11,7 +11,6 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-import epigauge as eg
 from epigauge._options import Backend, Detector, FrontEnd
 from epigauge.cli._common import (
     DONE,
@@ -25,11 +24,20 @@ from epigauge.cli._common import (
     warn,
     write_json,
 )
+from epigauge.cli._models import (
+    Intrinsics,
+    Model,
+    check_model,
+    finish_plane,
+    for_file,
+    for_json,
+    look_for,
+)
 from epigauge.cli._targets import Plot, Targets, outputs
 from epigauge.cli.refine import epipoles, standard_deviations
 from epigauge.errors import ArgumentError
 from epigauge.images import ImageMatches, match_images
-from epigauge.images.summary import summary
+from epigauge.images.summary import match_rows, summary
 from epigauge.io import plain, save_result
 from epigauge.two_view.robust import RobustResult
 
@@ -53,6 +61,8 @@ def pair(
         ),
     ] = 2000,
     max_features: Annotated[int, typer.Option(help="Strongest features kept.")] = 8000,
+    model: Model = "F",
+    intrinsics: Intrinsics = None,
     robust: Annotated[FrontEnd, choice(FrontEnd, "Robust start.")] = "auto",
     threshold_px: Annotated[
         float | None,
@@ -81,9 +91,21 @@ def pair(
     turned as its EXIF orientation says; (0, 0) is the centre of the top left
     one. Writes F with x2^T F x1 = 0 to stdout, three lines of three numbers;
     with --json everything known about it but the derivatives. A saved NPZ is
-    a file of matches too: `epigauge refine result.npz --inliers`.
+    a file of matches too: `epigauge refine result.npz --inliers`. With --model
+    E or H it is the essential matrix of normalised points, or H with x2 ~ H x1;
+    with --model auto the matrix of the model that the matches support, none
+    where they agree by chance.
     """
     targets = Targets(plot, output, json=json)
+    options: dict[str, Any] = {
+        "robust": robust,
+        "threshold_px": "auto" if threshold_px is None else threshold_px,
+        "noise_px": noise_px,
+        "max_iter": max_iter,
+        "seed": seed,
+        "backend": backend,
+    }
+    cameras = check_model(model, intrinsics, targets, options)
     os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # of damaged files our own errors tell
     out = console()
     begin = time.perf_counter()
@@ -99,16 +121,8 @@ def pair(
     middle = time.perf_counter()
     names = f"{shown(image1)}, {shown(image2)}"
     _check(matches, names)
-    options: dict[str, Any] = {
-        "robust": robust,
-        "threshold_px": "auto" if threshold_px is None else threshold_px,
-        "noise_px": noise_px,
-        "max_iter": max_iter,
-        "seed": seed,
-        "backend": backend,
-    }
     try:
-        result = eg.estimate_fundamental(matches.x1, matches.x2, **options)
+        found = look_for(model, matches.x1, matches.x2, None, cameras, options)
     except ArgumentError as error:
         if error.argument in ("x1", "x2", "x1, x2"):
             was = f"have {len(matches)} matches, which {error.was}"
@@ -116,8 +130,7 @@ def pair(
         raise
     seconds = middle - begin, time.perf_counter() - middle
 
-    std_F, std_sigma = standard_deviations(result.F, result.covariance)
-    more = {
+    more: dict[str, Any] = {
         "source": [str(image1), str(image2)],
         "image_size1": matches.image_size1,
         "image_size2": matches.image_size2,
@@ -125,25 +138,28 @@ def pair(
         "features": [matches.n_features1, matches.n_features2],
         "x1": matches.x1,
         "x2": matches.x2,
-        "std_F": std_F,
-        "std_sigma": std_sigma,
-        "epipoles": epipoles(result.F),
         "noise_estimated": noise_px is None,
         "seconds": seconds,
     }
-    targets.save(lambda path: save_result(path, result, **more))
+    title = f"{named(image1)} - {named(image2)}"
+    result = found.epipolar
+    if result is None:
+        rows = match_rows(matches, found.fit)
+        return finish_plane(found, title, rows, more, targets, json)
+    std_F, std_sigma = standard_deviations(result.F, result.covariance)
+    more |= {"std_F": std_F, "std_sigma": std_sigma, "epipoles": epipoles(result.F)}
+    targets.save(lambda path: save_result(path, result, **more, **for_file(found, path)))
     targets.draw(lambda path: _draw(path, result, matches, (image1, image2), seconds))
     if json:
         everything = plain(result)
         del everything["jac"]
-        write_json(everything | more)
+        write_json(everything | more | for_json(found))
     else:
         rows = summary(result, matches, seconds) | {"status": result.message}
-        title = escape(f"{named(image1)} - {named(image2)}")
-        out.print(facts(title, {name: escape(value) for name, value in rows.items()}))
+        out.print(facts(escape(title), {name: escape(value) for name, value in rows.items()}))
         warn(out, result)
         if not targets.on_stdout:
-            for row in result.F:
+            for row in result.F if result.E is None else result.E:
                 typer.echo(" ".join(f"{value: 24.17g}" for value in row))
     return DONE if result.success else NOT_CONVERGED
 

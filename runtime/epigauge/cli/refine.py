@@ -27,6 +27,7 @@ from epigauge.cli._common import (
     warn,
     write_json,
 )
+from epigauge.cli._models import Found, for_file, for_json
 from epigauge.cli._targets import ImageSize, Plot, Targets, outputs, save_drawing
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import Matches, load_matches, plain, save_result
@@ -110,6 +111,7 @@ def finish(
     rows: dict[str, str],
     targets: Targets,
     json: bool,
+    found: Found | None = None,
 ) -> int:
     """Save, draw and tell what came out of the matches of a file; return the exit code.
 
@@ -129,19 +131,21 @@ def finish(
         What to write.
     json : bool
         Whether to write JSON to stdout.
+    found : Found, optional
+        The model that was looked for, and more about it.
     """
     std_F, std_sigma = standard_deviations(result.F, result.covariance)
     more = more | {"std_F": std_F, "std_sigma": std_sigma, "epipoles": epipoles(result.F)}
-    targets.save(lambda path: save_result(path, result, **more))
+    targets.save(lambda path: save_result(path, result, **more, **for_file(found, path)))
     targets.draw(lambda path: _draw(path, result, pair, used, str(more["source"])))
     if json:
         everything = plain(result)
         del everything["jac"]
-        write_json(everything | more)
+        write_json(everything | more | for_json(found))
     else:
         _report(result, more, rows)
         if not targets.on_stdout:
-            for row in result.F:
+            for row in result.F if result.E is None else result.E:
                 typer.echo(" ".join(f"{value: 24.17g}" for value in row))
     return DONE if result.success else NOT_CONVERGED
 

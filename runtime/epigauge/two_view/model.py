@@ -31,7 +31,7 @@ from epigauge.two_view.robust import RobustResult, estimate_fundamental
 from epigauge.two_view.search import SCALES
 from epigauge.verdicts import ordered
 
-__all__ = ["TwoViewResult", "estimate_two_view"]
+__all__ = ["TwoViewResult", "estimate_two_view", "flat_evidence"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -112,12 +112,26 @@ class TwoViewResult(Result):
             return None
         return self._fundamental if self.model in ("F", "E") else self._homography
 
+    def _arrays(self) -> dict[str, Any]:
+        """Return the fields of NPZ, where the evidence is one number a name."""
+        contents = self._contents()
+        return contents | flat_evidence(contents.pop("evidence"))
+
     def _summary_rows(self) -> dict[str, str]:
         found = super()._summary_rows()
         count = f"{np.count_nonzero(self.inliers)} of {len(self.inliers)} matches"
         scores = {name: f"{entry['score']:.1f}" for name, entry in self.evidence.items()}
         text = ", ".join(f"{name} {score}" for name, score in scores.items())
         return {"model": found.pop("model"), "inliers": count, "scores": text} | found
+
+
+def flat_evidence(evidence: dict[str, dict[str, float]]) -> dict[str, float]:
+    """Return each number of the evidence by a name of its own: evidence_F_score."""
+    return {
+        f"evidence_{model}_{name}": value
+        for model, entry in evidence.items()
+        for name, value in entry.items()
+    }
 
 
 @logged
