@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
@@ -143,3 +145,16 @@ def matches(rng: np.random.Generator, F: Array, count: int, noise: float) -> tup
     # The foot of q2 on the line.
     q2 = q2 - line[:2] * (np.sum(line[:2] * q2, axis=0) + line[2]) / np.sum(line[:2] ** 2, axis=0)
     return tuple(q + noise * rng.standard_normal(q.shape) for q in (q1, q2))
+
+
+def unpacked(packed: np.ndarray) -> np.ndarray:
+    """Return the symmetric 9x9 matrix of an upper triangle."""
+    matrix = np.zeros((9, 9))
+    matrix[np.triu_indices(9)] = packed
+    return matrix + np.triu(matrix, 1).T
+
+
+def vect(matrix: Any) -> Any:
+    """Return a CasADi matrix row by row."""
+    casadi = pytest.importorskip("casadi")
+    return casadi.vec(matrix.T)

@@ -1,24 +1,19 @@
-"""Bundle adjustment of metric cameras: ties, priors, invariance, optima."""
+"""Bundle adjustment of metric cameras: ties, priors, methods, what is refused."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import epigauge as eg
 import many_views
 import numpy as np
 import pytest
-from epigauge import kernels
+from bundle_scenes import CASES, PRIORS, problem_of, scene
 from epigauge.bundle import compiled
 from epigauge.bundle import problem as problem_module
 from epigauge.bundle.dampings import Covariant
-from epigauge.bundle.jobs import metric_job
-from epigauge.bundle.observations import ObservationGraph
-from epigauge.bundle.problem import BundleProblem, BundleState, Estimate
-from epigauge.bundle.run import bundle_problem
-from epigauge.bundle.similarity import Similarity, normal_frame
+from epigauge.bundle.problem import BundleProblem, BundleState
 from epigauge.bundle.solve import Step
 from epigauge.bundle.strategies import STRATEGIES
 from epigauge.rotations import from_rodrigues, rodrigues
@@ -28,69 +23,6 @@ Array = many_views.Array
 
 #: All but Table 1, which is of projective cameras.
 METHODS = [name for name in STRATEGIES if not name.startswith("gauge_invariant")]
-
-
-def scene(
-    model: str = "SIMPLE_RADIAL",
-    params: Any = ((1000.0, 320.0, 240.0, -0.1),),
-    camera_of_view: Any = (0, 0, 0, 0),
-    m: int = 25,
-    seed: int = 0,
-) -> tuple[eg.Tracks, eg.MetricReconstruction]:
-    """Return tracks with a noise of one pixel, and a start near the truth."""
-    rng = np.random.default_rng(seed)
-    n = len(camera_of_view)
-    truth = many_views.cameras_and_points(n, m, seed=seed)
-    K = np.array([[1000.0, 0.0, 320.0], [0.0, 1000.0, 240.0], [0.0, 0.0, 1.0]])
-    pose = np.linalg.solve(K, truth.P)
-    cameras = eg.Cameras(model, params, camera_of_view)
-    right = eg.MetricReconstruction(pose[:, :, :3], pose[:, :, 3], truth.Q[:, :3], cameras)
-    view, point = np.tile(np.arange(n), m), np.repeat(np.arange(m), n)
-    xy = right.project(eg.Tracks(view, point, np.zeros((n * m, 2))))
-    tracks = eg.Tracks(view, point, xy + rng.standard_normal(xy.shape))
-    X = right.X + 0.02 * rng.standard_normal(right.X.shape)
-    t = right.t + 0.02 * rng.standard_normal(right.t.shape)
-    return tracks, eg.MetricReconstruction(right.R, t, X, cameras)
-
-
-def problem_of(
-    tracks: eg.Tracks, start: eg.MetricReconstruction, backend: str | None = None, **options: Any
-) -> tuple[BundleProblem, BundleState]:
-    asked = {"refine": "all", "fixed_views": (), "fixed_points": (), "priors": None, **options}
-    job = metric_job(tracks, start, **asked)
-    graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
-    problem = bundle_problem(
-        job.model,
-        kernels.table(backend),
-        graph,
-        job.q,
-        np.array(tracks.weights),
-        freedom=job.freedom,
-        priors=job.priors,
-    )
-    return problem, problem.evaluate(Estimate(job.cameras, job.points))
-
-
-COVARIANCE = np.array([[2e-4, 1e-4, 0.0], [1e-4, 3e-4, -1e-4], [0.0, -1e-4, 1e-4]])
-PRIORS = [
-    eg.PositionPrior(1, (-1.5, 0.1, -10.0), sigma=(0.01, 0.02, 0.05)),
-    eg.PositionPrior(3, (4.5, 0.1, -10.0), covariance=COVARIANCE),
-    eg.IntrinsicPrior(0, "f", 1010.0, 5.0),
-    eg.PointPrior(4, (0.1, 0.2, 0.0), covariance=COVARIANCE),
-    eg.RotationPrior(2, from_rodrigues(np.array([0.1, -0.2, 0.3])), covariance=COVARIANCE),
-    eg.RotationPrior(3, from_rodrigues(np.array([1.5, 1.2, -2.3])), sigma=(0.01, 0.02, 0.03)),
-]
-SHARED = {"params": [[1000.0, 320.0, 240.0, -0.1]] * 2, "camera_of_view": (0, 0, 1, 1)}
-LONE = {"params": [[1000.0, 320.0, 240.0, -0.1]] * 3, "camera_of_view": (0, 0, 1, 2)}
-CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "all": ({}, {}),
-    "groups": (SHARED, {"refine": ("f", "k")}),
-    "groups and lone views": (LONE, {"refine": ("k", "cx")}),
-    "pose": ({}, {"refine": "pose"}),
-    "fixed": (LONE, {"refine": ("f",), "fixed_views": [0, 3], "fixed_points": [2, 7, 8]}),
-    "priors": (SHARED, {"refine": ("f", "k"), "priors": PRIORS}),
-    "priors and fixed": (SHARED, {"fixed_views": [0], "fixed_points": [1], "priors": PRIORS}),
-}
 
 
 def residuals_of(problem: BundleProblem, state: BundleState, start: Any) -> Any:
@@ -240,16 +172,6 @@ def test_adjusted_ties_hold_and_the_gradient_vanishes(case: str) -> None:
     assert before.freedom.ties.n_shared == problem.freedom.ties.n_shared
 
 
-def similarity(seed: int, size: float = 1.0) -> Similarity:
-    """Return a random similarity: scale 1e-3 to 1e3, origin up to 1e5 scene radii away."""
-    rng = np.random.default_rng(seed)
-    Q = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-    s, far = 10.0 ** rng.uniform(-3, 3), rng.standard_normal(3)
-    far *= s * size * 10.0 ** rng.uniform(0, 5) / np.linalg.norm(far)
-    made: Similarity = eg.gauge.similarity(s, Q * np.sign(np.linalg.det(Q)), far)
-    return made
-
-
 def test_bounds_of_every_focal_length_hold_in_both_loops(monkeypatch: pytest.MonkeyPatch) -> None:
     many_views.need_backend("c")
     tracks, start = scene("PINHOLE", ((900.0, 990.0, 320.0, 240.0),) * 4, range(4))
@@ -262,79 +184,6 @@ def test_bounds_of_every_focal_length_hold_in_both_loops(monkeypatch: pytest.Mon
     np.testing.assert_allclose(*costs, rtol=1e-6)
     for run in runs:
         assert (run.reconstruction.cameras.params[:, :2] <= 990.5).all()
-
-
-class TestInvariance:
-    """The theorem of docs/gauges.md: equivariant update, covariant damping, choices by costs."""
-
-    def test_steps_are_equivariant_in_any_frame(self) -> None:
-        tracks, start = scene(**LONE)
-        problem, state = problem_of(tracks, start)
-        system = problem.linearize(state)
-        step = Covariant().step(system, 1e-3)
-        for seed in range(10):
-            rng = np.random.default_rng(seed)
-            there = replace(similarity(seed), target=rng.standard_normal(3))
-            moved = problem.evaluate(Estimate(*there.apply(state.cameras, state.points)))
-            other = Covariant().step(problem.linearize(moved), 1e-3)
-            cameras, points = there.blocks(4, 25, step.cameras.shape[1])
-            expected = np.einsum("nij,nj->ni", cameras, step.cameras)
-            size = np.abs(expected).max(axis=0)
-            assert distance(other.cameras / size, expected / size) < 1e-6
-            expected = np.einsum("mij,mj->mi", points, step.points)
-            size = np.abs(expected).max()
-            assert distance(other.points / size, expected / size) < 1e-6
-
-    def test_lambda_diag_of_the_usual_frame_is_not_invariant(self) -> None:
-        # Marquardt's diagonal of the points depends on the directions of the axes.
-        tracks, start = scene()
-        costs = [
-            eg.bundle_adjust(
-                tracks, eg.gauge.transform(start, similarity(seed)), method="marquardt", max_iter=3
-            )
-            .history[1]
-            .cost
-            for seed in range(3)
-        ]
-        assert np.ptp(costs) > 1e-6 * costs[0]
-
-    @pytest.mark.parametrize("case", ["pose", "groups", "priors"])
-    def test_whole_runs_are_the_same_in_any_frame(self, case: str) -> None:
-        made, options = CASES[case]
-        tracks, start = scene(**made)
-        expected = eg.bundle_adjust(tracks, start, **options)
-        for seed in range(20):
-            there, moved_options = similarity(seed), dict(options)
-            if options.get("priors"):
-                moved_options["priors"] = [_moved(prior, there) for prior in options["priors"]]
-            found = eg.bundle_adjust(tracks, eg.gauge.transform(start, there), **moved_options)
-            assert (found.nfev, found.status) == (expected.nfev, expected.status)
-            for a, b in zip(found.history, expected.history, strict=True):
-                assert a.cost == pytest.approx(b.cost, rel=1e-9)
-            back = eg.gauge.transform(found.reconstruction, there.inverse())
-            assert distance(back.X, expected.reconstruction.X) < 1e-3
-            assert distance(found.fun, expected.fun) < 1e-3
-
-    def test_the_normal_frame_is_the_same_from_anywhere(self) -> None:
-        _, start = scene()
-        points = normal_frame(start.vectors, start.X).positions(start.X)
-        for seed in range(5):
-            there = similarity(seed)
-            moved = eg.gauge.transform(start, there)
-            found = normal_frame(moved.vectors, moved.X).positions(moved.X)
-            assert distance(found @ there.rotation, points) < 1e-8
-
-
-def _moved(prior: Any, there: Similarity) -> Any:
-    if isinstance(prior, eg.IntrinsicPrior):
-        return prior
-    if isinstance(prior, eg.RotationPrior):  # deviations are in the camera's frame
-        return replace(prior, rotation=prior.rotation @ there.rotation.T)
-    C = prior.covariance
-    C = np.diag(np.square(prior.sigma)) if C is None else C
-    C = there.scale**2 * there.rotation @ C @ there.rotation.T
-    place = there.positions(np.array([prior.position]))[0]
-    return replace(prior, position=place, sigma=None, covariance=0.5 * (C + C.T))
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -456,40 +305,6 @@ def test_rank_counts_the_unknowns_and_what_fixes_the_gauge() -> None:
         assert np.isfinite(found.condition)
 
 
-def far_away(seed: int) -> tuple[eg.Tracks, eg.MetricReconstruction]:
-    """Return five cameras at a hundred times the scene's size, each with its own focal length."""
-    rng = np.random.default_rng(seed)
-    n, m, far = 5, 40, 100.0
-    angles = 0.3 * np.arange(n) - 0.75
-    R = np.zeros((n, 3, 3))
-    R[:, 0, 0] = R[:, 2, 2] = np.cos(angles)
-    R[:, 0, 2], R[:, 2, 0], R[:, 1, 1] = np.sin(angles), -np.sin(angles), 1.0
-    t = np.column_stack([np.zeros((n, 2)), far * (1.0 + 0.02 * np.arange(n))])
-    cameras = eg.Cameras("SIMPLE_RADIAL", [[300.0 * far, 320.0, 240.0, 0.0]] * n, range(n))
-    truth = eg.MetricReconstruction(R, t, rng.uniform(-1.0, 1.0, (m, 3)), cameras)
-    view, point = np.tile(np.arange(n), m), np.repeat(np.arange(m), n)
-    xy = truth.project(eg.Tracks(view, point, np.zeros((n * m, 2))))
-    return eg.Tracks(view, point, xy + rng.standard_normal(xy.shape)), truth
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_curved_valleys_of_weak_calibrations_are_followed_to_their_end(seed: int) -> None:
-    """Perspective is exchanged for distortion: the constant factor takes 56 to over 100 steps."""
-    tracks, start = far_away(seed)
-    found = eg.bundle_adjust(tracks, start, refine=("f", "k"))
-    assert found.success
-    assert found.nit <= 45
-    assert "weak geometry" in found.flags
-    assert found.weakest
-    # The reference loop, which a callback asks for, takes the same course as the default.
-    watched = eg.bundle_adjust(tracks, start, refine=("f", "k"), callback=lambda _: None)
-    assert [row.lam for row in watched.history] == pytest.approx(
-        [row.lam for row in found.history], rel=1e-3
-    )
-    best = eg.bundle_adjust(tracks, start, refine=("f", "k"), ftol=1e-13, max_iter=400)
-    assert found.cost <= best.cost * (1.0 + 1e-6)
-
-
 def test_what_nothing_determines_is_named() -> None:
     """Six coefficients of one radius: numerator and denominator exchange in a narrow view."""
     params = [[1000.0, 1000.0, 320.0, 240.0, -0.1, 0.01, 1e-3, 1e-3, 1e-3, 2e-3, 3e-3, 1e-3]]
@@ -521,97 +336,3 @@ def test_gauge_groups_are_those_of_the_cameras() -> None:
         eg.gauge.transform(start, np.eye(4))
     with pytest.raises(eg.ArgumentError, match="reflection"):
         eg.gauge.similarity(1.0, -np.eye(3), np.zeros(3))
-
-
-#: Steps to 1e-6 of the optimum that are enough (measured: 6 and 4), and the optimum.
-BAL = {"problem-49-7776": (8, 13344.2403), "problem-16-22106": (6, 18033.90348)}
-
-
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) for n in BAL])
-def test_bal_problems_reach_the_optimum_in_few_steps(data_dir: Path, name: str) -> None:
-    many_views.need_backend("c")
-    enough, optimum = BAL[name]
-    tracks, start = eg.load_scene(data_dir / "bal" / f"{name}-pre.txt.bz2")
-    expected = eg.bundle_adjust(tracks, start)
-    assert expected.cost == pytest.approx(optimum, rel=1e-7)
-    size = float(np.median(np.linalg.norm(start.X - start.X.mean(axis=0), axis=1)))
-    for result in (
-        expected,
-        *(
-            eg.bundle_adjust(tracks, eg.gauge.transform(start, similarity(seed, size)))
-            for seed in range(20)
-        ),
-    ):
-        near = [row.cost <= optimum * (1.0 + 1e-6) for row in result.history]
-        assert near.index(True) <= enough
-        assert len(result.history) == len(expected.history)
-        for a, b in zip(result.history, expected.history, strict=True):
-            assert a.cost == pytest.approx(b.cost, rel=1e-9)
-
-
-def bal_like(seed: int) -> tuple[eg.Tracks, eg.MetricReconstruction]:
-    """Return tracks of the size of BAL's problem 21, a pixel's noise, and a start a little off.
-
-    21 cameras of BAL's kind on an arc in front of 11,315 points, 36,455 observations in runs of
-    neighbouring views.
-    """
-    n, m, N = 21, 11315, 36455
-    rng = np.random.default_rng(seed)
-    X = rng.uniform([-4.0, -2.0, -3.0], [4.0, 2.0, 3.0], (m, 3))
-    angles = np.linspace(-0.9, 0.9, n) + 0.03 * rng.standard_normal(n)
-    out = 10.0 * rng.uniform(0.8, 1.2, n)
-    centres = np.column_stack(
-        [out * np.sin(angles), rng.uniform(-0.5, 0.5, n), out * np.cos(angles)]
-    )
-    R = np.empty((n, 3, 3))
-    for i in range(n):
-        z = centres[i] - rng.uniform(-0.5, 0.5, 3)  # it looks along -z
-        z /= np.linalg.norm(z)
-        x = np.cross([0.05 * rng.standard_normal(), 1.0, 0.0], z)
-        x /= np.linalg.norm(x)
-        R[i] = [x, np.cross(z, x), z]
-    f, k1 = rng.uniform(600.0, 1200.0, n), rng.uniform(-0.08, 0.0, n)
-    params = np.column_stack([f, k1, np.zeros(n)])
-    lengths = 2 + rng.poisson(N / m - 2.0, m)
-    while lengths.sum() != N:
-        j = rng.integers(m)
-        lengths[j] = np.clip(lengths[j] + np.sign(N - lengths.sum()), 2, n)
-    first = (rng.random(m) * (n - lengths + 1)).astype(int)
-    begin = np.repeat(np.cumsum(lengths) - lengths, lengths)
-    point = np.repeat(np.arange(m), lengths)
-    view = first[point] + np.arange(N) - begin
-
-    def seen(R: Array, centres: Array, X: Array, params: Array) -> eg.MetricReconstruction:
-        t = -np.einsum("nij,nj->ni", R, centres)
-        return eg.MetricReconstruction(R, t, X, eg.Cameras("bal", params, range(n)))
-
-    blank = eg.Tracks(view, point, np.zeros((N, 2)))
-    xy = seen(R, centres, X, params).project(blank) + 0.8 * rng.standard_normal((N, 2))
-    # The nearest rotations to (I + [w]) R.
-    w = 0.005 * rng.standard_normal((n, 3))
-    U, _, Vt = np.linalg.svd(R + np.cross(w[:, None], np.swapaxes(R, 1, 2)).swapaxes(1, 2))
-    turned = U @ Vt
-    start = seen(
-        turned,
-        centres + 0.05 * rng.standard_normal((n, 3)),
-        X + 0.1 * rng.standard_normal((m, 3)),
-        params * np.column_stack([1.0 + 0.03 * rng.standard_normal(n), np.zeros((n, 2))]),
-    )
-    return eg.Tracks(blank.view, blank.point, xy), start
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
-def test_a_problem_of_the_size_of_bal_21_needs_at_most_five_steps(seed: int) -> None:
-    many_views.need_backend("c")
-    tracks, start = bal_like(seed)
-    best = eg.bundle_adjust(tracks, start, ftol=1e-12).cost
-    found = eg.bundle_adjust(tracks, start)
-    assert found.success
-    assert found.cost <= best * (1.0 + 1e-6)
-    near = [row.cost <= best * (1.0 + 1e-6) for row in found.history]
-    assert near.index(True) <= 5
-    # Noise of 0.8 px, and what the unknowns take of it.
-    unknowns = 9 * tracks.n_views + 3 * tracks.n_points - 7
-    freedom = 2 * len(tracks) - unknowns
-    assert 2.0 * found.cost / freedom == pytest.approx(0.64, rel=0.03)

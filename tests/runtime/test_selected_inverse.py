@@ -103,8 +103,8 @@ class Network:
         job = metric_job(tracks, scene, **(choices | options))
         table, weights = kernels.table(backend), np.asarray(tracks.weights)
         graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
-        home: Any = best_conditioned(job.model, job.cameras, job.points)
-        self.at = home.apply(job.cameras, job.points)
+        home: Any
+        home, *self.at = best_conditioned(job.model, job.cameras, job.points)
         priors = None if job.priors is None else job.priors.moved(home)
         problem = bundle_problem(
             *(job.model, table, graph, job.q, weights), freedom=job.freedom, priors=priors

@@ -193,13 +193,13 @@ def _together(graph: ObservationGraph, counts: Indices) -> Indices:
 
 def _chunks(counts: Indices) -> tuple[Indices, Indices]:
     """Return where the lanes and the rows of each chunk begin, for falling counts."""
-    lanes, rows = [0], [0]
-    begin, m, all_slots = 0, len(counts), counts.tolist()
+    m = len(counts)
+    widths = np.clip(_ROWS // counts // LANES * LANES, LANES, _MOST_LANES).tolist()
+    begins, begin = [], 0
     while begin < m:
-        slots = all_slots[begin]
-        width = min(max(_ROWS // slots // LANES * LANES, LANES), _MOST_LANES)
-        width = min(width, -(-(m - begin) // LANES) * LANES)
-        lanes.append(lanes[-1] + width)
-        rows.append(rows[-1] + width * slots)
-        begin += width
-    return np.array(lanes, np.intp), np.array(rows, np.intp)
+        begins.append(begin)
+        begin += widths[begin]
+    # The last chunk has as many lanes as it needs, in full vectors.
+    lanes = np.append(begins, min(begin, begins[-1] + -(-(m - begins[-1]) // LANES) * LANES))
+    rows = np.concatenate([[0], np.cumsum(np.diff(lanes) * counts[begins])])
+    return lanes.astype(np.intp), rows.astype(np.intp)

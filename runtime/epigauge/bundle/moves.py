@@ -87,11 +87,15 @@ def move_into(gauge: Gauge, model: CameraModel, cameras: Array, points: Array) -
     return found
 
 
-def best_conditioned(model: CameraModel, cameras: Array, points: Array) -> Move:
-    """Return the move to where computing suits best."""
+def best_conditioned(
+    model: CameraModel, cameras: Array, points: Array
+) -> tuple[Move, Array, Array]:
+    """Return the move to where computing suits best, and cameras and points there."""
     if model.homogeneous:
-        return move_into(normalized(), model, cameras, points)
-    return normal_frame(cameras, points) if model.metric else _spread_evenly(points)
+        there, P, Q = normalized().moved(cameras.reshape(-1, 3, 4), points)
+        return _Projective(there), P.reshape(-1, 12), Q
+    move: Move = normal_frame(cameras, points) if model.metric else _spread_evenly(points)
+    return (move, *move.apply(cameras, points))
 
 
 def _spread_evenly(points: Array) -> _Affine:

@@ -187,16 +187,17 @@ def minimized(
         free = bundle_problem(
             *(job.model, kernels, graph, job.q, weights, loss), embedded=True, workers=workers
         )
-        there = best_conditioned(job.model, cameras, points)
-        moved = BundleState(Estimate(*there.apply(cameras, points)), state.cost)
-        there = best_conditioned(job.model, begun.cameras, begun.points)
-        start = Estimate(*there.apply(begun.cameras, begun.points))
+        moved = BundleState(Estimate(*best_conditioned(job.model, cameras, points)[1:]), state.cost)
+        start = Estimate(*best_conditioned(job.model, begun.cameras, begun.points)[1:])
         return not far.short_of_minimum(free, moved, start)
 
     def attempt(cameras: Array, points: Array) -> tuple[lm.Outcome[BundleState], Array, Array]:
         start = job.model, cameras, points
-        there = best_conditioned(*start) if home else move_into(wanted or identity(), *start)
-        cameras, points = there.apply(cameras, points)
+        if home:
+            there, cameras, points = best_conditioned(*start)
+        else:
+            there = move_into(wanted or identity(), *start)
+            cameras, points = there.apply(cameras, points)
         priors = job.priors
         if priors is not None:
             assert isinstance(there, Similarity)

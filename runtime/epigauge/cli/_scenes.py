@@ -107,10 +107,11 @@ class SceneJob:
         lines: Path | None = None,
     ) -> None:
         self.path, self.rigs, self.image_size = path, rigs, image_size
-        self.tracks, self.start = load_scene(path)
-        if not isinstance(self.start, eg.MetricReconstruction):
+        self.tracks, start = load_scene(path)
+        if not isinstance(start, eg.MetricReconstruction):
             was = "is given with cameras that are not calibrated"
             raise ArgumentError("--refine", was, "a scene with calibrated ones, or none")
+        self.start = start
         self.lines = None if lines is None else load_line_tracks(lines, self.tracks)
         if self.start.lines is not None and lines is None:
             was = f"has {len(self.start.lines)} lines, which would be lost"

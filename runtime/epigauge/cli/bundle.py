@@ -61,8 +61,8 @@ from epigauge.io import (
     save_colmap_model,
     save_result,
 )
+from epigauge.io._track_writing import arrays_of
 from epigauge.io.scene_files import is_scene
-from epigauge.io.tracks import arrays_of
 from epigauge.multi_view.display import Display, display
 from epigauge.multi_view.pinhole import PinholeModel, pinhole_model
 from epigauge.verdicts import explained, usable

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from epigauge import kernels
 from epigauge.bundle.linearizer import Linearizer, Normal, PointRefinement
-from epigauge.bundle.native_linearizer import NativeCoupling, NativeLinearizer
+from epigauge.bundle.native_coupling import NativeCoupling
+from epigauge.bundle.native_linearizer import NativeLinearizer
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.bundle.skyline import Skyline
 from epigauge.cameras import camera_model

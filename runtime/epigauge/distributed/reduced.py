@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from epigauge._native import Blocks
 from epigauge.bundle.dense import DensePairs
 from epigauge.bundle.linearizer import Pairs
-from epigauge.bundle.native_linearizer import NativeLinearizer, NativePairs
+from epigauge.bundle.native_coupling import NativePairs
+from epigauge.bundle.native_linearizer import NativeLinearizer
 from epigauge.cameras import CameraModel
 from epigauge.distributed.observations import Order
 from epigauge.distributed.sums import Rows

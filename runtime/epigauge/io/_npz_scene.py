@@ -17,8 +17,9 @@ from epigauge.io._colmap_text import camera_line, camera_of, frame_line, frame_o
 from epigauge.io._common import MAX_MATCHES, cut
 from epigauge.io._npz import read_npz, write_npz
 from epigauge.io._scene import ColmapSource, RawScene, SceneSource
+from epigauge.io._track_reading import MEASURED, check_observations
+from epigauge.io._track_writing import arrays_of
 from epigauge.io.output import writing
-from epigauge.io.tracks import MEASURED, arrays_of, check_observations
 from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.tracks import Tracks
 

@@ -17,7 +17,7 @@ from epigauge.cameras import (
     MetricReconstruction,
 )
 from epigauge.errors import ArgumentError, FileFormatError
-from epigauge.io.tracks import restore_measurement
+from epigauge.io._track_reading import restore_measurement
 from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.tracks import Tracks
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +20,9 @@ from epigauge.io._common import PathLike
 from epigauge.io._exports import write_gltf, write_transforms
 from epigauge.io._npz_scene import is_npz_scene, read_npz_scene, write_npz_scene
 from epigauge.io._scene import RawScene, SceneSource, finished
+from epigauge.io._track_reading import decompressing
+from epigauge.io._track_writing import compressing
 from epigauge.io.output import writing
-from epigauge.io.tracks import compressing, decompressing
 from epigauge.multi_view.tracks import Tracks
 from epigauge.rotations import from_rodrigues, rodrigues
 
@@ -36,7 +36,9 @@ _REPEATED = ("keep", "first", "refuse")
 _WEAK = ("drop", "refuse")
 
 
-def load_scene(path: PathLike, *, repeated: str = "keep", weak: str = "drop") -> tuple[Tracks, Any]:
+def load_scene(
+    path: PathLike, *, repeated: str = "keep", weak: str = "drop"
+) -> tuple[Tracks, AnyReconstruction]:
     """Read a scene: observations, cameras, points.
 
     A directory is a COLMAP model, binary (``cameras.bin``, ``images.bin``, ``points3D.bin``) or

@@ -67,20 +67,12 @@ def sampled(tracks: Tracks) -> Sample:
     chosen = np.zeros(tracks.n_points, dtype=np.bool_)
     chosen[tracks.point[rows[np.arange(len(rows)) - first[views] < count]]] = True
     chosen &= lengths >= 2
-    points = np.flatnonzero(chosen)
-    if len(points) > 0.7 * tracks.n_points:
+    if np.count_nonzero(chosen) > 0.7 * tracks.n_points:
         return Sample(tracks, np.arange(tracks.n_points), True)
-    keep = chosen[tracks.point] & counts
-    renumbered = np.cumsum(chosen) - 1
     try:
-        part = Tracks(
-            tracks.view[keep],
-            renumbered[tracks.point[keep]],
-            tracks.xy[keep],
-            tracks.n_views,
-            len(points),
-            tracks.weights[keep],
-        )
+        part, views, points = tracks.subset(chosen[tracks.point] & counts)
     except ArgumentError:
+        return Sample(tracks, np.arange(tracks.n_points), True)
+    if len(views) < tracks.n_views:
         return Sample(tracks, np.arange(tracks.n_points), True)
     return Sample(part, points, False)

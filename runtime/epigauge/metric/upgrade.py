@@ -135,22 +135,12 @@ class MetricUpgrade(Result):
             raise ArgumentError("result", "has no scene", "tracks that determine one")
         good = ~self.rejected & (tracks.weights > 0.0)
         lengths = np.bincount(tracks.point[good], minlength=tracks.n_points)
-        points = np.flatnonzero(lengths >= MIN_VIEWS)
         good &= lengths[tracks.point] >= MIN_VIEWS
-        number = np.cumsum(lengths >= MIN_VIEWS) - 1
-        part = Tracks(
-            tracks.view[good],
-            number[tracks.point[good]],
-            tracks.xy[good],
-            tracks.n_views,
-            len(points),
-            tracks.weights[good],
-            names=tracks.names,
-            sizes=tracks.sizes,
-            colours=None if tracks.colours is None else tracks.colours[points],
-            min_points=1,
-            repeated=True,
-        )
+        part, views, points = tracks.subset(good, min_points=1)
+        lost = np.setdiff1d(np.arange(tracks.n_views), views)
+        if len(lost):
+            was = f"leave no good observation of view {lost[0]}"
+            raise ArgumentError("tracks", was, "a scene without that view")
         scene = self.reconstruction
         return part, MetricReconstruction(scene.R, scene.t, scene.X[points], scene.cameras)
 

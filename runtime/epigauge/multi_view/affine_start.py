@@ -93,7 +93,7 @@ def initialize_affine(
         if k:
             filled += np.where(known[:, None], 0.0, rng.standard_normal(filled.shape))
         cameras, points = _factors(filled, known)
-        cameras, points = best_conditioned(model, cameras, points).apply(cameras, points)
+        cameras, points = best_conditioned(model, cameras, points)[1:]
         try:
             stopping = lm.Stopping(ftol=1e-6, xtol=0.0, gtol=0.0, max_iter=_STEPS)
             start = Estimate(cameras, points)
@@ -107,7 +107,7 @@ def initialize_affine(
             break
     if best is None:
         raise ArgumentError("tracks", "lead to no affine start", "longer tracks, or a start")
-    moved = best_conditioned(model, best.cameras, best.points).apply(best.cameras, best.points)
+    moved = best_conditioned(model, best.cameras, best.points)[1:]
     P = frame.cameras_out(moved[0].reshape(-1, 3, 4))
     return AffineReconstruction(P[:, :2], moved[1])
 

@@ -70,10 +70,9 @@ def counted(tracks: Tracks) -> Tracks:
     counts = tracks.weights > 0.0
     if counts.all():
         return tracks
-    view, point, xy, weights = (
-        array[counts] for array in (tracks.view, tracks.point, tracks.xy, tracks.weights)
-    )
     try:
-        return Tracks(view, point, xy, tracks.n_views, tracks.n_points, weights)
+        some, views, points = tracks.subset(counts)
     except ArgumentError:
         return tracks
+    whole = len(views) == tracks.n_views and len(points) == tracks.n_points
+    return some if whole else tracks

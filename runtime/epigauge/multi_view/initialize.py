@@ -155,7 +155,7 @@ def _best_factored(tracks: Tracks, frame: Frame, kernels: Table, seed: int) -> R
             loss = Loss("cauchy", max(float(np.nan_to_num(scale, posinf=1.0)), 1e-12))
             problem = replace(problem, linearizer=problem.linearizer.with_loss(loss))
         try:
-            moved = best_conditioned(projective, P.reshape(-1, 12), Q).apply(P.reshape(-1, 12), Q)
+            moved = best_conditioned(projective, P.reshape(-1, 12), Q)[1:]
             found = lm.minimize(problem, Estimate(*moved), Covariant(), lm.Classic(), stopping)
         except np.linalg.LinAlgError:
             continue

@@ -33,6 +33,10 @@ _NONE, _FEW = 0.05, 0.1
 #: that turned: beyond it, the camera may only have turned.
 _TURNED = 0.75
 
+#: Rows and columns of the upper triangle of a symmetric 3x3 matrix, and its places in that.
+_ROWS, _COLUMNS = np.triu_indices(3)
+_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+
 #: Reweighted least squares against points off the plane. It converges quadratically where nine in
 #: ten are on one: where after the second number of rounds most are off it, more will not help.
 _ROUNDS, _FIRST_ROUNDS, _MOSTLY = 8, 3, 0.5
@@ -82,17 +86,27 @@ def parallax_flags(seen: Seen, noise_px: float) -> tuple[str, ...]:
 
 def _plainly_off(seen: Seen, limit: float) -> bool:
     """Tell whether a first pair, of views far from each other in a sequence, shows parallax."""
-    others = partners(seen, np.searchsorted(seen.point, np.arange(seen.m + 1)), 0)
+    others = partners(seen, 0)
     if not len(others):
         return False
     x1, x2, first = _matches(seen, np.array([[0, others.max()]]))
-    off = fit_homographies(x1, x2, first, _FIRST_ROUNDS).distances > limit
-    return bool(np.mean(off) > _MOSTLY)
+    fit = _Fit(x1, x2, first)
+    for _ in range(_FIRST_ROUNDS):
+        fit.again()
+    off = fit.scale * fit.distances > limit
+    return bool(np.count_nonzero(off) > _MOSTLY * len(off))
 
 
-def partners(seen: Seen, begin: Indices, i: int) -> Indices:
+def partners(seen: Seen, i: int) -> Indices:
     """Return views with points in common with view i: with the fewest, with some, with the most."""
-    own = seen.point[seen.view == i]
+    found = seen.partners.get(i)
+    if found is None:
+        found = seen.partners[i] = _partners(seen, i)
+    return found
+
+
+def _partners(seen: Seen, i: int) -> Indices:
+    begin, own = seen.begin, seen.point[seen.view == i]
     lengths = begin[own + 1] - begin[own]
     rows = np.repeat(begin[own] - np.cumsum(lengths) + lengths, lengths)
     common = np.bincount(seen.view[rows + np.arange(len(rows))], minlength=seen.n)
@@ -108,14 +122,13 @@ def _pairs(seen: Seen) -> Iterator[Indices]:
 
     Those with few see from far apart. Views are asked at a bounded number of places in a sequence.
     """
-    begin = np.searchsorted(seen.point, np.arange(seen.m + 1))
     asked = np.unique(np.linspace(0, seen.n - 1, min(seen.n, _VIEWS)).astype(np.intp))
     # Evenly spread from the first few on.
     stride = -(-len(asked) // _AT_ONCE)
     for some in (asked[k::stride] for k in range(stride)):
         chosen: list[tuple[int, int]] = []
         for i in some.tolist():
-            chosen += [(i, k) for k in partners(seen, begin, i).tolist()]
+            chosen += [(i, k) for k in partners(seen, i).tolist()]
         if chosen:
             yield np.array(chosen)
 
@@ -189,46 +202,74 @@ def fit_homographies(x1: Array, x2: Array, first: Indices, rounds: int = _ROUNDS
     Homographies
         One a group.
     """
-    both = np.concatenate([x1, x2])
-    centre = both.mean(axis=0)
-    scale = max(float(np.sqrt(np.mean((both - centre) ** 2))), 1e-300)
-    a = np.column_stack([(x1 - centre) / scale, np.ones(len(x1))])
-    b = (x2 - centre) / scale
-    group = np.repeat(np.arange(len(first) - 1), np.diff(first))
-    square = a[:, :, None] * a[:, None, :]
-    terms = np.stack([np.ones(len(a)), *b.T, np.sum(b**2, axis=1)], axis=1)
-    blocks = terms[:, :, None, None] * square[:, None]
-    weights = np.ones(len(a))
+    fit = _Fit(x1, x2, first)
     for _ in range(rounds):
-        sums = np.add.reduceat(weights[:, None, None, None] * blocks, first[:-1])
-        N = np.zeros((len(first) - 1, 9, 9))
+        fit.again()
+    H, values, vectors, scale = fit.H, fit.values, fit.vectors, fit.scale
+    size = np.cbrt(np.linalg.det(H))
+    size = np.where(np.abs(size) > 1e-12, size, 1.0)
+    inverse = vectors[:, :, 1:] / np.maximum(values[:, None, 1:], 1e-300)
+    covariance = inverse @ np.swapaxes(vectors[:, :, 1:], 1, 2)
+    factor = fit.typical_depth / size**2 * _means(fit.weights**2, first)
+    covariance *= factor[:, None, None]
+    return Homographies(H / size[:, None, None], scale * fit.distances, covariance, scale)
+
+
+class _Fit:
+    """Reweighted normal equations of groups of matches, in coordinates of mean zero and size one.
+
+    Attributes
+    ----------
+    H : ndarray, shape (k, 3, 3)
+        Homographies of unit norm.
+    distances, weights : ndarray, shape (m,)
+        Transfer errors, and what they count in the next round.
+    """
+
+    def __init__(self, x1: Array, x2: Array, first: Indices) -> None:
+        both = np.concatenate([x1, x2])
+        centre = both.mean(axis=0)
+        self.scale = max(float(np.sqrt(np.mean((both - centre) ** 2))), 1e-300)
+        self._a = a = np.column_stack([(x1 - centre) / self.scale, np.ones(len(x1))])
+        self._b = b = (x2 - centre) / self.scale
+        self._first, self._sizes = first, np.diff(first)
+        self._group = np.repeat(np.arange(len(first) - 1), self._sizes)
+        square = a[:, _ROWS] * a[:, _COLUMNS]
+        terms = np.stack([np.ones(len(a)), *b.T, np.sum(b**2, axis=1)], axis=1)
+        self._blocks = (terms[:, :, None] * square[:, None]).reshape(len(a), -1)
+        self.weights = np.ones(len(a))
+
+    def again(self) -> None:
+        """Fit with the weights that the fit before gives."""
+        first, sizes, group = self._first, self._sizes, self._group
+        if len(sizes) == 1:
+            flat = (self.weights @ self._blocks)[None]
+        else:
+            flat = np.add.reduceat(self.weights[:, None] * self._blocks, first[:-1])
+        sums = flat.reshape(-1, 4, 6)[:, :, _SYMMETRIC]
+        N = np.zeros((len(sizes), 9, 9))
         N[:, :3, :3] = N[:, 3:6, 3:6] = sums[:, 0]
         N[:, :3, 6:] = N[:, 6:, :3] = -sums[:, 1]
         N[:, 3:6, 6:] = N[:, 6:, 3:6] = -sums[:, 2]
         N[:, 6:, 6:] = sums[:, 3]
-        values, vectors = np.linalg.eigh(N)
-        H = vectors[:, :, 0].reshape(-1, 3, 3)
-        h = np.einsum("mij,mj->mi", H[group], a)
+        self.values, self.vectors = np.linalg.eigh(N)
+        self.H = H = self.vectors[:, :, 0].reshape(-1, 3, 3)
+        h = self._a @ H[0].T if len(sizes) == 1 else np.einsum("mij,mj->mi", H[group], self._a)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            distances = np.linalg.norm(h[:, :2] / h[:, 2:] - b, axis=1)
+            off = h[:, :2] / h[:, 2:] - self._b
+            distances = np.sqrt(off[:, 0] ** 2 + off[:, 1] ** 2)
         distances[~np.isfinite(distances)] = 1e3
+        self.distances = distances
         typical = np.maximum(_medians(distances, group, first), 1e-9)[group]
         # Algebraic errors are h_3 times geometric ones.
-        depth = h[:, 2] ** 2 / np.repeat(_means(h[:, 2] ** 2, first), np.diff(first))
-        weights = 1.0 / (1.0 + (distances / typical) ** 2) / np.maximum(depth, 1e-6)
-    size = np.cbrt(np.linalg.det(H))
-    size = np.where(np.abs(size) > 1e-12, size, 1.0)
-    inverse = vectors[:, :, 1:] / np.maximum(values[:, None, 1:], 1e-300)
-    typical_depth = _means(h[:, 2] ** 2, first)
-    covariance = inverse @ np.swapaxes(vectors[:, :, 1:], 1, 2)
-    covariance *= (typical_depth / size**2)[:, None, None] * _means(weights**2, first)[
-        :, None, None
-    ]
-    return Homographies(H / size[:, None, None], scale * distances, covariance, scale)
+        depth = h[:, 2] ** 2
+        self.typical_depth = _means(depth, first)
+        relative = np.maximum(depth / self.typical_depth[group], 1e-6)
+        self.weights = 1.0 / (1.0 + (distances / typical) ** 2) / relative
 
 
 def _medians(values: Array, group: Indices, first: Indices) -> Array:
-    rising = values[np.lexsort((values, group))]
+    rising = np.sort(values) if len(first) == 2 else values[np.lexsort((values, group))]
     low, high = (first[:-1] + first[1:] - 1) // 2, (first[:-1] + first[1:]) // 2
     return np.asarray(0.5 * (rising[low] + rising[high]))
 

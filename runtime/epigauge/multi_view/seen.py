@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,16 @@ class Seen:
     def m(self) -> int:
         """Return the number of points."""
         return len(self.Q)
+
+    @cached_property
+    def begin(self) -> Indices:
+        """Return the first observation of each point, and N."""
+        return np.searchsorted(self.point, np.arange(self.m + 1))
+
+    @cached_property
+    def partners(self) -> dict[int, Indices]:
+        """Return the partners of views that were asked for (`parallax.partners`)."""
+        return {}
 
     @staticmethod
     def of_network(tracks: Tracks) -> Seen:

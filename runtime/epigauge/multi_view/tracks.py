@@ -209,6 +209,63 @@ class Tracks(Result):
         tracks = cls(new_views, new_points, pixels[keep], weights=w[keep])
         return tracks, all_views[old_views], all_points[old_points]
 
+    def subset(
+        self, keep: ArrayLike, *, min_points: int = MIN_POINTS
+    ) -> tuple[Tracks, Indices, Indices]:
+        """Return some of the observations; views and points without any are left out.
+
+        Names, sizes, colours, weights and what whitens observations go along.
+
+        Parameters
+        ----------
+        keep : array_like of bool, shape (N,)
+            Which, in the order of the tracks (not of their input).
+        min_points : int
+            Observations that a view left needs, as for the constructor.
+
+        Returns
+        -------
+        tracks : Tracks
+            Those, renumbered; `order` refers to the rows kept.
+        views, points : ndarray of int
+            Old numbers of the views and points left.
+
+        Raises
+        ------
+        ArgumentError
+            If it is no mask, and as the constructor, of what is left.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> tracks = eg.multi_view_scene(n_points=20, seed=1).tracks
+        >>> some, views, points = tracks.subset(tracks.point < 12)
+        >>> some, points.max()
+        (Tracks(5 views, 12 points, 60 observations), np.int64(11))
+        """
+        mask = as_array("keep", keep, "a mask (N,)")
+        if mask.dtype != np.bool_ or mask.shape != (len(self),):
+            was = f"is {mask.dtype} {mask.shape}"
+            raise ArgumentError("keep", was, f"a bool an observation, ({len(self)},)")
+        if not mask.any():
+            raise ArgumentError("keep", "keeps no observation", "at least one")
+        views, view = np.unique(self.view[mask], return_inverse=True)
+        points, point = np.unique(self.point[mask], return_inverse=True)
+        tracks = Tracks(
+            view,
+            point,
+            self.xy[mask],
+            weights=self.weights[mask],
+            names=None if self.names is None else [self.names[i] for i in views],
+            sizes=None if self.sizes is None else self.sizes[views],
+            colours=None if self.colours is None else self.colours[points],
+            repeated=bool(self.n_repeated),
+            min_points=min_points,
+        )
+        tracks.unit = self.unit
+        tracks.whitening = None if self.whitening is None else self.whitening[:, :, mask]
+        return tracks, views, points
+
     def weighted(self, weights: ArrayLike) -> Tracks:
         """Return the same observations with other weights.
 

@@ -90,7 +90,11 @@ class MetricGaugeStudy(Experiments):
     def problem(self, name: str) -> Scene | None:
         """Return a measured problem, or None where it is not there."""
         path = self.file("bal", _PROBLEMS[name])
-        return None if path is None else load_scene(path)
+        if path is None:
+            return None
+        tracks, start = load_scene(path)
+        assert isinstance(start, MetricReconstruction)
+        return tracks, start
 
 
 def adjust(

@@ -149,9 +149,9 @@ class _Network(NamedTuple):
 
 def _of_points(tracks: Tracks, job: Job, table: Table) -> _Network:
     graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
-    home = best_conditioned(job.model, job.cameras, job.points)
+    home, cameras, points = best_conditioned(job.model, job.cameras, job.points)
     assert isinstance(home, Similarity)
-    at = Estimate(*home.apply(job.cameras, job.points))
+    at = Estimate(cameras, points)
     priors = None if job.priors is None else job.priors.moved(home)
 
     def normal(weights: Array) -> tuple[float, BundleSystem, NumpyLinearizer]:

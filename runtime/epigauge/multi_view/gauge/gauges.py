@@ -162,7 +162,7 @@ class five_points:
         chosen = self.choose(Q) if self.points is None else list(self.points)
         basis = Q[chosen[:4]].T
         T = basis * np.linalg.solve(basis, Q[chosen[4]])
-        return _unit_scales(T, P, Q)
+        return _unit_scales(T, P, Q)[0]
 
     def similarity(self, cameras: Array, points: Array) -> Similarity:
         """Return what moves three points to (0, 0, 0), (1, 0, 0) and the plane z = 0."""
@@ -254,6 +254,10 @@ class normalized:
 
     def transformation(self, P: Array, Q: Array) -> Transformation:
         """Return what moves cameras and points into the gauge."""
+        return self.moved(P, Q)[0]
+
+    def moved(self, P: Array, Q: Array) -> tuple[Transformation, Array, Array]:
+        """Return what moves cameras and points into the gauge, and both there."""
         return _unit_scales(spreading_basis(Q), P, Q)
 
     def similarity(self, cameras: Array, points: Array) -> Similarity:
@@ -293,12 +297,13 @@ class inner:
 GAUGES = (identity, reference_camera, two_cameras, five_points, normalized)
 
 
-def _unit_scales(T: Array, P: Array, Q: Array) -> Transformation:
-    """Return T with the scales that make every camera and point of unit norm."""
+def _unit_scales(T: Array, P: Array, Q: Array) -> tuple[Transformation, Array, Array]:
+    """Return T with the scales that make every camera and point of unit norm, and both moved."""
     moved_P, moved_Q = P @ T, np.linalg.solve(T, Q.T)
-    return Transformation(
-        T, 1.0 / np.linalg.norm(moved_P, axis=(1, 2)), 1.0 / np.linalg.norm(moved_Q, axis=0)
-    )
+    gamma = 1.0 / np.sqrt(np.einsum("nij,nij->n", moved_P, moved_P))
+    alpha = 1.0 / np.sqrt(np.einsum("im,im->m", moved_Q, moved_Q))
+    moved = gamma[:, None, None] * moved_P, np.ascontiguousarray((alpha * moved_Q).T)
+    return (Transformation(T, gamma, alpha), *moved)
 
 
 def _scaled(T: Array, P: Array, third: Array, camera: int) -> Transformation:

@@ -75,8 +75,8 @@ def _turned(evidence: Evidence, found: MetricReconstruction, noise_px: float) ->
     asked = 0
     for i in np.unique(np.linspace(0, n - 1, min(n, 10)).astype(np.intp)):
         seen = evidence.around(int(i))
-        begin, X = np.searchsorted(seen.point, np.arange(seen.m + 1)), found.X[seen.points]
-        for k in partners(seen, begin, int(i)):
+        X = found.X[seen.points]
+        for k in partners(seen, int(i)):
             both = np.zeros((2, seen.m), np.bool_)
             for side, one in enumerate((i, k)):
                 both[side, seen.point[seen.view == one]] = True

@@ -65,10 +65,9 @@ def affine_pairs(seen: Seen, images: Array, noise_px: float) -> bool:
     noise_px : float
         Standard deviation of a coordinate.
     """
-    begin = np.searchsorted(seen.point, np.arange(seen.m + 1))
     asked = 0
     for i in np.unique(np.linspace(0, seen.n - 1, min(seen.n, 10)).astype(np.intp)):
-        for k in partners(seen, begin, int(i)):
+        for k in partners(seen, int(i)):
             rows = np.full((2, seen.m), -1)
             for side, one in enumerate((i, k)):
                 own = np.flatnonzero(seen.view == one)

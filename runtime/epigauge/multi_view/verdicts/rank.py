@@ -105,8 +105,8 @@ def _measured(
     V = white.V + q[:, :, None] * q[:, None, :]
     if held is not None:
         U[held[0]], V[held[1]] = np.eye(a), np.eye(V.shape[1])
-    open_points, V = _grounded(V)
-    T = whitening[1] @ np.asarray(np.swapaxes(np.linalg.inv(np.linalg.cholesky(V)), 1, 2))
+    open_points, root = _grounded(V)
+    T = whitening[1] @ np.asarray(np.swapaxes(np.linalg.inv(root), 1, 2))
     if held is not None:
         T[held[1]] = 0.0
     coupling = system.normal.coupling
@@ -197,19 +197,23 @@ def _least(
 
 
 def _grounded(V: Array) -> tuple[int, Array]:
-    """Return how many directions of single points are open, and the blocks with these closed."""
+    """Return how many directions of single points are open, and roots of the blocks, these closed.
+
+    Lower triangular.
+    """
     try:
-        diagonal = np.einsum("nii->ni", np.linalg.cholesky(V + 1e-14 * np.eye(4)))
+        root = np.linalg.cholesky(V + 1e-14 * np.eye(4))
+        diagonal = np.einsum("nii->ni", root)
         thin = np.flatnonzero(diagonal.min(axis=1) ** 2 <= 1e3 * _ROUNDING)
     except np.linalg.LinAlgError:  # some block is singular to rounding: all are looked at
         thin = np.arange(len(V))
     if not len(thin):
-        return 0, V
+        return 0, np.asarray(root)
     values, vectors = np.linalg.eigh(V[thin])
     open_ = values <= _ROUNDING
     V = V.copy()
     V[thin] = (vectors * np.where(open_, 1.0, values)[:, None]) @ np.swapaxes(vectors, 1, 2)
-    return int(np.count_nonzero(open_)), V
+    return int(np.count_nonzero(open_)), np.asarray(np.linalg.cholesky(V))
 
 
 def _mean_diagonal(blocks: Array) -> Array:

@@ -19,8 +19,8 @@ def flatness(found: MetricReconstruction | AffineReconstruction, noise_px: float
     The third singular value of the measurements of affine cameras over that of noise, whose largest
     one is the sum of the roots of both sizes.
     """
-    moved = best_conditioned(camera_model("affine"), found.P.reshape(-1, 12), found.X)
-    P = moved.apply(found.P.reshape(-1, 12), found.X)[0].reshape(-1, 3, 4)
+    moved = best_conditioned(camera_model("affine"), found.P.reshape(-1, 12), found.X)[1]
+    P = moved.reshape(-1, 3, 4)
     rows, m = P[:, :2, :3].reshape(-1, 3), len(found.X)
     third = float(np.linalg.svd(rows, compute_uv=False)[2]) * np.sqrt(m)
     return float(noise_px * (np.sqrt(len(rows)) + np.sqrt(m)) / max(third, 1e-300))

@@ -1,0 +1,73 @@
+"""Writing tracks: the arrays that stand for them, and tables."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+from contextlib import AbstractContextManager, nullcontext
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from epigauge.errors import ArgumentError
+from epigauge.multi_view.tracks import Tracks
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+def arrays_of(tracks: Tracks) -> dict[str, Any]:
+    """Return the arrays that stand for tracks in NPZ.
+
+    Weights only where they are not all one, names of views where there are any; unit and whitening,
+    (N, 2, 2), only where the measurements had a `sigma` or a `covariance`.
+    """
+    found: dict[str, Any] = {"view": tracks.view, "point": tracks.point, "xy": tracks.xy}
+    if (tracks.weights != 1.0).any():
+        found["weights"] = tracks.weights
+    if tracks.names is not None:
+        found["names"] = np.array(tracks.names)
+    if tracks.unit != 1.0:
+        found["unit"] = np.array(tracks.unit)
+    if tracks.whitening is not None:
+        found["whitening"] = tracks.whitening.transpose(2, 0, 1)
+    return found
+
+
+def write_csv(file: IO[bytes], tracks: Tracks) -> None:
+    if tracks.whitening is not None:
+        was = "have coordinates measured unlike, or together, for which CSV has no place"
+        raise ArgumentError("tracks", was, "a name ending in .npz")
+    arrays = arrays_of(tracks)
+    names = None if tracks.names is None else np.array(list(map(_label, tracks.names)))
+    views = tracks.view if names is None else names[tracks.view]
+    head = ["view", "point", "x", "y", *(["weight"] if "weights" in arrays else [])]
+    columns = [views, tracks.point, *tracks.xy.T]
+    columns += [arrays["weights"]] if "weights" in arrays else []
+    file.write((",".join(head) + "\n").encode())
+    for row in zip(*(column.tolist() for column in columns), strict=True):
+        file.write((",".join(map(_written, row)) + "\n").encode())
+
+
+def _label(name: str) -> str:
+    """Return the name of a view as a field, quoted where it has to be."""
+    if not name.isprintable():
+        raise ArgumentError("names", f"hold {name!r:.60}", "names of one line for CSV, or NPZ")
+    special = name != name.strip() or any(mark in name for mark in ",;#\"'")
+    return '"' + name.replace('"', '""') + '"' if special else name
+
+
+def _written(value: object) -> str:
+    """Return a field of a table."""
+    return value if isinstance(value, str) else repr(value)
+
+
+def compressing(file: IO[bytes], form: str) -> AbstractContextManager[Any]:
+    """Return a stream into a file whose suffix is given."""
+    if not form.endswith(("gz", "bz2")):
+        return nullcontext(file)
+    # No date in the file: the same content gives the same bytes.
+    if form.endswith("gz"):
+        return gzip.GzipFile("", "wb", 9, file, 0.0)
+    return bz2.BZ2File(file, "wb")
