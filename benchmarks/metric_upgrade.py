@@ -1,11 +1,13 @@
 """Metric upgrades: motions that leave intrinsics open, and measured tracks with known cameras.
 
     python benchmarks/metric_upgrade.py [--trials 50]
-    python benchmarks/metric_upgrade.py --data FOLDER
+    python benchmarks/metric_upgrade.py --lenses [--trials 50]
+    python benchmarks/metric_upgrade.py --data FOLDER [--parts]
 
 The first prints which share of simulated scenes of each motion is flagged, and how the errors of
-the focal length compare with their standard deviations. The second takes a folder with one folder
-a data set, each with a tracks.npz with K, as those of Strecha and of Olsson.
+the focal length compare with their standard deviations; the second the same of lenses that the
+camera model does not describe. The third takes a folder with one folder a data set, each with a
+tracks.npz with K, as those of Strecha and of Olsson; with --parts halves of their views.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import epigauge as eg
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from calibration import SIZE, tracks_of
+from calibration import CENTRE, SIZE, tracks_of
 
 MOTIONS = ("general", "translation", "rotation", "axis", "point")
 NAMED = {
@@ -54,36 +56,146 @@ def simulated(trials: int) -> None:
         print(f"{motion:12} {trials:7} {flagged:8} {named:6} {good:8} {spread:12.2f}   {words}")
 
 
-def measured(folder: Path) -> None:
-    """Print a line a data set with known K."""
-    print(f"{'set':26} focal_px     std    true   error  sigmas  rms_px  seconds  flags")
-    for path in sorted(folder.glob("*/tracks.npz")):
+def simulated_lenses(trials: int) -> None:
+    """Print a line a kind of lens or track that the camera model does not describe."""
+    print(
+        f"{'lens':28} trials  success  largest error  < 3 sigma or flagged  flagged  rms of sigmas"
+    )
+    for name, change in LENSES.items():
+        errors, sigmas, flagged, held, good = [], [], 0, 0, 0
+        for seed in range(trials):
+            rng = np.random.default_rng(5000 + seed)
+            views, points = int(rng.integers(5, 20)), int(rng.integers(150, 600))
+            _, scene = tracks_of("general", 5000 + seed, n_views=views, n_points=points)
+            tracks = seen_by(scene, change(rng, views), rng)
+            found = eg.metric_upgrade(tracks, image_size=SIZE)
+            good += found.success
+            if found.success:
+                errors.append(abs(found.focal_px / 900.0 - 1.0))
+                sigmas.append((found.focal_px - 900.0) / found.focal_std_px)
+                flagged += bool(found.flags)
+                held += abs(sigmas[-1]) < 3.0 or bool(found.flags)
+        spread = float(np.sqrt(np.mean(np.square(sigmas))))
+        worst = 100.0 * max(errors)
+        print(
+            f"{name:28} {trials:6} {good:8} {worst:13.2f}% {held:21} {flagged:8} {spread:14.2f}",
+            flush=True,
+        )
+
+
+def seen_by(
+    scene: eg.MetricReconstruction, params: np.ndarray, rng: np.random.Generator
+) -> eg.Tracks:
+    """Return tracks of a scene seen by other cameras (OPENCV, a row a view), 1 % of them wrong."""
+    views, points = len(scene.R), len(scene.X)
+    sees = rng.random((views, points)) < 0.5
+    sees[:2] = True
+    view, point = np.nonzero(sees)
+    cameras = eg.Cameras("OPENCV", params, np.arange(views))
+    other = eg.MetricReconstruction(scene.R, scene.t, scene.X, cameras)
+    blank = eg.Tracks(view, point, np.zeros((len(view), 2)))
+    xy = other.project(blank)
+    xy = xy + rng.normal(0.0, 0.4, xy.shape)
+    wrong = rng.random(len(xy)) < 0.01
+    xy[wrong] += rng.uniform(-80.0, 80.0, (int(wrong.sum()), 2))
+    return eg.Tracks(blank.view, blank.point, xy)
+
+
+def lens(views: int, **given: float | np.ndarray) -> np.ndarray:
+    """Return OPENCV cameras of 900 px but for what is given, a row a view."""
+    value = {
+        "stretch": 0.0,
+        "centre": 0.0,
+        "k1": -0.1,
+        "k2": 0.0,
+        "p1": 0.0,
+        "p2": 0.0,
+        "focus": 0.0,
+    }
+    value |= given
+    f = 900.0 * (1.0 + np.broadcast_to(value["focus"], views))
+    rows = [f * (1.0 - 0.5 * value["stretch"]), f * (1.0 + 0.5 * value["stretch"])]
+    rows += [np.full(views, centre + value["centre"]) for centre in CENTRE]
+    rows += [np.full(views, value[name]) for name in ("k1", "k2", "p1", "p2")]
+    return np.column_stack(rows)
+
+
+LENSES = {
+    "as the model": lambda rng, n: lens(n, centre=rng.normal(0.0, 8.0)),
+    "fx and fy 0.17 % apart": lambda rng, n: lens(n, stretch=0.0017),
+    "k2 = 0.1 beside k1": lambda rng, n: lens(n, k2=0.1),
+    "k2 = 0.3 beside k1 = -0.3": lambda rng, n: lens(n, k1=-0.3, k2=0.3),
+    "tangential 0.002": lambda rng, n: lens(n, p1=0.002, p2=-0.002),
+    "focus varies by 0.1 %": lambda rng, n: lens(n, focus=rng.normal(0.0, 1e-3, n)),
+    "focus varies by 0.5 %": lambda rng, n: lens(n, focus=rng.normal(0.0, 5e-3, n)),
+}
+
+
+def measured(folder: Path, parts: bool) -> None:
+    """Print a line a data set with known K, or a line a part of its views."""
+    print(f"{'set':38} views focal_px     std    true   error  sigmas  rms_px  seconds  flags")
+    for path in sorted(folder.glob("*/tracks*.npz")):
         with np.load(path) as data:
             z = {name: data[name] for name in data.files}
-        strecha = path.parent.name.startswith("strecha")
-        size = np.array([3072, 2048]) if strecha else z.get("image_size")
+        size = z.get("image_size", SIZES.get(path.parent.name))
         if "K" not in z or size is None:
             continue
         tracks = eg.Tracks(z["view"], z["point"], z["xy"])
         true = np.array(z["K"]).reshape(-1, 3, 3)[0, [0, 1], [0, 1]].mean()
-        begin = time.process_time()
-        found = eg.metric_upgrade(tracks, image_size=size)
-        seconds = time.process_time() - begin
-        error = 100.0 * (found.focal_px / true - 1.0)
-        sigmas = (found.focal_px - true) / found.focal_std_px
-        print(
-            f"{path.parent.name:26} {found.focal_px:9.2f} {found.focal_std_px:7.2f} {true:7.1f} "
-            f"{error:+6.2f}% {sigmas:+7.2f} {found.rms_px:7.4f} {seconds:8.2f}  "
-            f"{', '.join(found.flags) or '-'}"
-        )
+        name = path.parent.name + path.stem.removeprefix("tracks")
+        if not parts:
+            row(name, tracks, size, true)
+            continue
+        n, order = tracks.n_views, np.arange(tracks.n_views)
+        for label, views in {
+            "even": order[::2],
+            "odd": order[1::2],
+            "first half": order[: n // 2 + 1],
+            "last half": order[n // 2 :],
+            "middle third": order[n // 3 : -(n // 3)],
+        }.items():
+            if len(views) < 4:
+                continue
+            keep = np.isin(tracks.view, views)
+            try:
+                kept, *_ = eg.Tracks.pruned(tracks.view[keep], tracks.point[keep], tracks.xy[keep])
+            except eg.ArgumentError:
+                continue
+            row(f"{name} {label}", kept, size, true)
+
+
+#: Of sets that do not tell.
+SIZES = {"sba_demo": np.array([640, 480])}
+
+
+def row(name: str, tracks: eg.Tracks, size: np.ndarray, true: float) -> None:
+    """Print how far the focal length of tracks is from the true one."""
+    begin = time.process_time()
+    found = eg.metric_upgrade(tracks, image_size=size)
+    seconds = time.process_time() - begin
+    flags = ", ".join(found.flags) or "-"
+    if not found.success:
+        print(f"{name:38} {tracks.n_views:5} not determined {seconds:8.2f}  {flags}", flush=True)
+        return
+    error = 100.0 * (found.focal_px / true - 1.0)
+    sigmas = (found.focal_px - true) / found.focal_std_px
+    print(
+        f"{name:38} {tracks.n_views:5} {found.focal_px:8.2f} {found.focal_std_px:7.2f} {true:7.1f} "
+        f"{error:+6.2f}% {sigmas:+7.2f} {found.rms_px:7.4f} {seconds:8.2f}  {flags}",
+        flush=True,
+    )
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--trials", type=int, default=50)
     parser.add_argument("--data", type=Path)
+    parser.add_argument("--parts", action="store_true")
+    parser.add_argument("--lenses", action="store_true")
     options = parser.parse_args()
-    if options.data is None:
-        simulated(options.trials)
+    if options.data is not None:
+        measured(options.data, options.parts)
+    elif options.lenses:
+        simulated_lenses(options.trials)
     else:
-        measured(options.data)
+        simulated(options.trials)

@@ -12,15 +12,18 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 import epigauge as eg
+from epigauge.cameras import camera_model
 from epigauge.cli._common import DONE, NOT_CONVERGED, console, facts, shown
 from epigauge.cli._scenes import save_cloud
 from epigauge.cli.metric import camera_rows
 from epigauge.errors import ArgumentError, FileFormatError
+from epigauge.images.exif import exif_focal_px
 from epigauge.images.loading import thumbnail
 from epigauge.images.pairwise import names_of
 from epigauge.images.tracks import NoTracks, TrackSource, build_tracks
@@ -33,8 +36,14 @@ from epigauge.verdicts import explained, usable
 
 __all__ = ["scene"]
 
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
 #: Photographs in a folder are files with these endings.
 _PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".ppm", ".pgm")
+#: Share of a nominal focal length that it is uncertain by, and that a zoom changes it by.
+_NOMINAL, _ZOOMED = 0.1, 0.02
+
 _DATABASES = (".db", ".sqlite", ".sqlite3")
 
 
@@ -56,6 +65,13 @@ def scene(
     camera: Annotated[str, typer.Option(help="Camera model.")] = "SIMPLE_RADIAL",
     pairs: Annotated[str, typer.Option(help="Pairs to match: all or sequential.")] = "all",
     max_features: Annotated[int, typer.Option(help="Features of each photograph.")] = 5000,
+    exif_focal: Annotated[
+        bool,
+        typer.Option(
+            "--exif-focal",
+            help="Take focal lengths in EXIF data for known to ten percent; never needed.",
+        ),
+    ] = False,
     cache: Annotated[
         Path | None, typer.Option(help="NPZ file for features and matches, to begin there again.")
     ] = None,
@@ -73,21 +89,25 @@ def scene(
         raise ArgumentError("--cameras", f"is {cameras!r:.60}", "auto, one, own or size")
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise ArgumentError("--output", f"exists: {shown(output)}", "a new or an empty folder")
+    if exif_focal and _is_database(sources):
+        raise ArgumentError("--exif-focal", "is given with a database", "photographs")
     begin, out = time.perf_counter(), console()
+    photographs: dict[str, Path] = {}
     try:
         with _progress(out) as told:
             found = sources[0] if _is_database(sources) else _photographs(sources)
             options: dict[str, Any] = {}
             if isinstance(found, list):
                 options = {"pairs": pairs, "max_features": max_features, "cache": cache}
+                photographs = dict(zip(names_of(found), found, strict=True))
             tracks = build_tracks(found, progress=told, **options)
             told("cameras", 0, 1)
-            result = _upgraded(tracks, cameras, camera)
+            focal = _exif_focal(tracks, photographs) if exif_focal else None
+            result = _upgraded(tracks, cameras, camera, focal)
     except NoTracks as error:
         out.print(f"[bold red]no scene:[/] the photographs {escape(error.was)}", soft_wrap=True)
         out.print(f"needed: {escape(error.needed)}", soft_wrap=True)
         return NOT_CONVERGED
-    photographs = dict(zip(names_of(found), found, strict=True)) if isinstance(found, list) else {}
     answer = _Answer(tracks, result, photographs, time.perf_counter() - begin)
     answer.report(out)
     if not result.success:
@@ -141,15 +161,47 @@ class _progress:
         self.bars.update(self.tasks[what], completed=done)
 
 
-def _upgraded(tracks: eg.Tracks, cameras: str, camera: str) -> eg.MetricUpgrade:
+def _exif_focal(tracks: eg.Tracks, photographs: dict[str, Path]) -> Array:
+    """Return the focal length that each photograph tells, NaN where it does not."""
+    sizes = np.asarray(tracks.sizes).tolist()
+    told = [
+        exif_focal_px(photographs[name], (w, h))
+        for name, (w, h) in zip(tracks.names or (), sizes, strict=True)
+    ]
+    return np.array([np.nan if focal is None else focal for focal in told])
+
+
+def _priors(focal: Array | None, groups: Indices, camera: str) -> list[eg.IntrinsicPrior]:
+    """Return what the photographs tell of each camera's focal length: their median."""
+    found, model = [], camera_model(camera)
+    for c in range(int(groups.max()) + 1) if focal is not None else ():
+        assert focal is not None
+        own = focal[(groups == c) & np.isfinite(focal)]
+        if len(own):
+            value = float(np.median(own))
+            names = [model.params[k] for k in model.focal]
+            found += [eg.IntrinsicPrior(c, name, value, _NOMINAL * value) for name in names]
+    return found
+
+
+def _upgraded(
+    tracks: eg.Tracks, cameras: str, camera: str, focal: Array | None
+) -> eg.MetricUpgrade:
     """Return the metric scene; with "auto", of own cameras where one does not fit."""
     sizes = np.asarray(tracks.sizes)
+    n = len(sizes)
     kinds = np.unique(sizes, axis=0, return_inverse=True)[1].ravel()
     one = len(np.unique(kinds)) == 1
-    shared: Any = {"one": True, "own": False, "size": kinds, "auto": one}[cameras]
-    result = eg.metric_upgrade(tracks, image_size=sizes, shared=shared, camera=camera)
+    if focal is not None and np.isfinite(focal).any():  # a zoom that was turned
+        one &= bool(np.nanmax(focal) < (1.0 + _ZOOMED) * np.nanmin(focal))
+    same, own = np.zeros(n, dtype=np.intp), np.arange(n)
+    groups = {"one": same, "own": own, "size": kinds, "auto": same if one else own}[cameras]
+    options: Any = {"image_size": sizes, "camera": camera}
+    known = _priors(focal, groups, camera)
+    result = eg.metric_upgrade(tracks, shared=groups, priors=known, **options)
     if cameras == "auto" and one and "unlike cameras" in result.flags:
-        other = eg.metric_upgrade(tracks, image_size=sizes, shared=False, camera=camera)
+        known = _priors(focal, own, camera)
+        other = eg.metric_upgrade(tracks, shared=own, priors=known, **options)
         result = other if other.success else result
     return result
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import kernels
+from epigauge.bundle.prior_kinds import IntrinsicPrior
 from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.metric.quadric import Basis, Views, metric_bases
@@ -117,12 +118,21 @@ class Search:
         Threads.
     backend : str or None
         Where the formulas are computed.
+    priors : tuple of IntrinsicPrior
+        What is known of the cameras.
     """
 
     def __init__(
-        self, sample: Sample, images: Images, camera: str, workers: int, backend: str | None
+        self,
+        sample: Sample,
+        images: Images,
+        camera: str,
+        workers: int,
+        backend: str | None,
+        priors: tuple[IntrinsicPrior, ...] = (),
     ) -> None:
         self.sample, self.images, self.camera = sample, images, camera
+        self.priors = priors
         self.options: Any = {"workers": workers, "backend": backend}
         self.backend: Any = backend
         #: Why there is no scene, where there is none.
@@ -208,9 +218,19 @@ class Search:
     ) -> MetricReconstruction:
         """Return the scene after a robust adjustment of poses, points and some intrinsics."""
         found = bundle_adjust(
-            self.sample.tracks, scene, refine=names, loss="cauchy", ftol=1e-4, **self.options
+            self.sample.tracks,
+            scene,
+            refine=names,
+            priors=self._of(names),
+            loss="cauchy",
+            ftol=1e-4,
+            **self.options,
         )
         return metric_of(found)
+
+    def _of(self, names: tuple[str, ...]) -> tuple[IntrinsicPrior, ...] | None:
+        """Return what is known of intrinsics that are refined."""
+        return tuple(prior for prior in self.priors if prior.name in names) or None
 
     def _first(self) -> tuple[str, ...]:
         """Return the names of the focal lengths."""
@@ -239,7 +259,8 @@ class Search:
         tracks = self.sample.tracks
         distances = np.linalg.norm(tracks.xy - scene.project(tracks), axis=1)
         weights = np.where(distances > 6.0 * median(distances), 0.0, tracks.weights)
-        known = covariance(tracks.weighted(weights), scene, refine=names, backend=self.backend)
+        options: Any = {"refine": names, "priors": self._of(names), "backend": self.backend}
+        known = covariance(tracks.weighted(weights), scene, **options)
         blocks = [np.diag(known.intrinsics(c)) for c in range(len(scene.cameras))]
         std = np.sqrt(np.median(blocks, axis=0))
         unit = float(np.median(self.images.unit))
@@ -253,7 +274,12 @@ class Search:
         tracks: Tracks = self.sample.tracks
         squares = np.sum((tracks.xy - scene.project(tracks)) ** 2, axis=1)
         rho = scale_px**2 * np.log1p(squares / scale_px**2)
-        return 0.5 * float(np.sum(tracks.weights * rho))
+        model = camera_model(self.camera)
+        known = [
+            (scene.cameras.params[p.camera, model.params.index(p.name)] - p.value) / p.sigma
+            for p in self.priors
+        ]
+        return 0.5 * float(np.sum(tracks.weights * rho) + scale_px**2 * np.sum(np.square(known)))
 
     def _candidate(
         self, basis: Basis, ahead: float, scene: MetricReconstruction, cost: float

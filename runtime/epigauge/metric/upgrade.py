@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -11,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from epigauge import kernels
 from epigauge._arguments import as_array, as_count, as_real
 from epigauge._results import Result
-from epigauge.cameras import MetricReconstruction
+from epigauge.bundle.prior_kinds import IntrinsicPrior
+from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.metric.deviation import focal_lengths_of, known_to, turn_std
 from epigauge.metric.motion import motion_flags
@@ -36,6 +38,9 @@ Indices = NDArray[np.intp]
 #: Relative decrease of the cost that ends the adjustment whose residuals only tell gross errors,
 #: and the last ones: of 1e5 observations the latter leaves a few hundredths of a deviation.
 _EARLY, _LATE = 1e-2, 1e-8
+
+#: Median distance of two normal coordinates of standard deviation one.
+_MEDIAN = 1.1774
 
 #: Last adjustments at most, and the share of the observations that may change sides after them.
 _ROUNDS, _SETTLED = 4, 1e-3
@@ -152,6 +157,7 @@ def metric_upgrade(
     image_size: ArrayLike,
     shared: bool | ArrayLike = True,
     camera: str = "SIMPLE_RADIAL",
+    priors: Iterable[IntrinsicPrior] | None = None,
     workers: int = 1,
     backend: str | None = None,
 ) -> MetricUpgrade:
@@ -173,7 +179,11 @@ def metric_upgrade(
         True: one camera took all views. False: each view has a camera of its own. Numbers: the
         camera of each view, from 0; its views have one size.
     camera : str
-        Model of the cameras: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or FULLOPENCV.
+        Model of the cameras: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or
+        FULL_OPENCV.
+    priors : iterable of IntrinsicPrior, optional
+        What is known of intrinsics, such as focal lengths from EXIF data: it counts by its `sigma`
+        beside the noise of the tracks, and can determine what the motion leaves open.
     workers : int
         Threads, as of `bundle_adjust`.
     backend : {"c", "numpy", "casadi"}, optional
@@ -220,14 +230,17 @@ def metric_upgrade(
             was = f"is of {size[0]} views and {size[1]} points"
             needed = f"{tracks.n_views} and {tracks.n_points}, as the tracks"
             raise ArgumentError("reconstruction", was, needed)
-    search = Search(sampled(tracks), images, camera, workers, backend)
+    known = _priors(priors, camera, int(images.group.max()) + 1)
+    search = Search(sampled(tracks), images, camera, workers, backend, known)
     fit = search.run(reconstruction)
     if fit is None:
         return _nothing(tracks, images, search.flags)
     start = fit.reconstruction
     if not search.sample.whole:
         start = with_all_points(start, tracks, images, kernels.table(backend))
-    options: Any = {"refine": fit.refined, "workers": workers, "backend": backend}
+    refined = tuple(prior for prior in known if prior.name in fit.refined)
+    options: Any = {"refine": fit.refined, "priors": refined or None}
+    options |= {"workers": workers, "backend": backend}
     try:
         bundle = _adjusted(tracks, start, options, backend)
     except ArgumentError:  # so degenerate that no step can be made
@@ -247,6 +260,8 @@ def _adjusted(
     given = np.asarray(tracks.weights)
     found = bundle_adjust(tracks, start, loss="cauchy", ftol=_EARLY, **options)
     aside = _aside(search, found)
+    if options["priors"]:  # they count beside the noise
+        options = options | {"noise_px": _noise_px(found, tracks, aside | (given == 0.0))}
     for _ in range(_ROUNDS):
         kept = tracks.weighted(np.where(aside, 0.0, given))
         found = bundle_adjust(kept, metric_of(found), ftol=_LATE, **options)
@@ -285,7 +300,11 @@ def _judged(
     flags, turned, factor = set(bundle.flags), 0.0, 1.0
     std = np.full(len(focal), np.inf)
     try:
-        known = covariance(tracks.weighted(weights), found, refine=fit.refined, backend=backend)
+        options: Any = {"refine": fit.refined, "backend": backend}
+        priors = tuple(prior for prior in search.priors if prior.name in fit.refined)
+        if priors:
+            options |= {"priors": priors, "noise_px": _noise_px(bundle, tracks, weights == 0.0)}
+        known = covariance(tracks.weighted(weights), found, **options)
         std, factor, erroneous = known_to(known, float(np.median(images.unit)))
         if erroneous:
             flags.add("model error")
@@ -298,9 +317,12 @@ def _judged(
     # By the noise alone: what a lens does beside tells nothing of the motion.
     if known is not None and (share > WEAK * factor).any():
         turned = turn_std(known)
-    flags |= set(motion_flags(found, images, turned))
+    motion = set(motion_flags(found, images, turned))
     if (share > OPEN * factor).any():
         flags.add("undetermined")
+    elif search.priors:  # these determine what the motion does not
+        motion.discard("pure translation")
+    flags |= motion
     of_sample = np.isin(tracks.point, search.sample.points)
     if search.misfit(fit, median(np.linalg.norm(bundle.fun[of_sample], axis=1))):
         flags.add("unlike cameras")
@@ -322,6 +344,14 @@ def _judged(
         bundle=bundle,
         covariance=known,
     )
+
+
+def _noise_px(bundle: BundleResult, tracks: Tracks, aside: NDArray[np.bool_]) -> float:
+    """Return the standard deviation of a coordinate of what is not set aside, robustly."""
+    distances = np.linalg.norm(bundle.fun[~aside], axis=1)
+    unknowns = 6 * tracks.n_views + 3 * len(np.unique(tracks.point[~aside]))
+    free = max(1.0 - unknowns / max(2 * len(distances), 1), 0.05)
+    return max(median(distances) / _MEDIAN / float(np.sqrt(free)), 1e-9)
 
 
 def _rms_px(bundle: BundleResult, weights: Array) -> float:
@@ -374,6 +404,23 @@ def _images(tracks: Tracks, image_size: ArrayLike, shared: bool | ArrayLike) -> 
             was = f"gives camera {c} images of different sizes"
             raise ArgumentError("shared", was, "one size a camera; False for a camera a view")
     return Images(sizes, group)
+
+
+def _priors(
+    priors: Iterable[IntrinsicPrior] | None, camera: str, count: int
+) -> tuple[IntrinsicPrior, ...]:
+    """Check what is known of the cameras."""
+    found, names = tuple(priors or ()), camera_model(camera).adjusted
+    for prior in found:
+        if not isinstance(prior, IntrinsicPrior):
+            raise ArgumentError("priors", f"holds a {type(prior).__name__}", "eg.IntrinsicPrior")
+        if prior.name not in names or not 0 <= prior.camera < count:
+            was = f"names {prior.name!r:.40} of camera {prior.camera}"
+            raise ArgumentError("priors", was, f"{', '.join(names)} of cameras 0 to {count - 1}")
+        if not (np.isfinite(prior.value) and np.isfinite(prior.sigma) and prior.sigma > 0.0):
+            was = f"gives {prior.name} as {prior.value} +- {prior.sigma}"
+            raise ArgumentError("priors", was, "finite numbers, the deviation positive")
+    return found
 
 
 def _groups(shared: ArrayLike, n: int) -> Indices:
