@@ -151,6 +151,11 @@ FLAGS = {
         "(epipolar plane), or one very far away",
         "leave such lines out, or take images from beside that plane",
     ),
+    "wrong segments": Flag(
+        "some segments are more than twelve standard deviations away from the images of their "
+        "lines: matched to wrong lines",
+        "leave them out (`line_fun` tells which), or use a robust loss",
+    ),
     "gross errors": Flag(
         "a few matches carry most of the error: wrong ones among them, which least squares bends "
         "the result to",

@@ -93,9 +93,10 @@ def bundle_adjust(
         Segments of lines, adjusted together with the points: the distances of their end points from
         the images of the lines. For metric starts with one of the methods "covariant",
         "levenberg" and "marquardt", without gauge, priors and `robust`. The lines begin at those of
-        the start, or triangulated; without `lines` those of the start are left out, and the result
-        has none. `workers` does not count. Cameras with distortion see end points that are
-        undistorted once, with their covariances to first order: then ``refine="pose"``.
+        the start, or triangulated where that suits their segments better; without `lines` those of
+        the start are left out, and the result has none. `workers` does not count. Cameras with
+        distortion see end points that are undistorted once, with their covariances to first order:
+        then ``refine="pose"``.
     refine : "all", "pose" or sequence of str
         Intrinsics of a metric start to be refined beside rotations, positions and points: all of
         them, none, or those named, such as ``("f", "k1")``. "f" of a model with fx and fy changes

@@ -13,17 +13,24 @@ from epigauge._arguments import as_choice, as_positive
 from epigauge.bundle.dampings import DAMPINGS, LAM_FLOOR_METRIC, Covariant
 from epigauge.bundle.diagnosis import diagnosed
 from epigauge.bundle.jobs import Job, metric_job
-from epigauge.bundle.lines import LineLinearizer, unit_lines
+from epigauge.bundle.lines import LineLinearizer, Segments, unit_lines
 from epigauge.bundle.observations import ObservationGraph, whitened
 from epigauge.bundle.problem import BundleProblem, BundleState, Estimate
 from epigauge.bundle.run import bundle_problem
 from epigauge.bundle.similarity import Similarity, normal_frame
 from epigauge.bundle.solve import BundleSystem
-from epigauge.cameras import MetricReconstruction
+from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
+from epigauge.multi_view.line_agreement import BEYOND, lengths, usual
 from epigauge.multi_view.line_segments import segments_of
-from epigauge.multi_view.line_start import OPEN, checked_scene, spreads, triangulated
+from epigauge.multi_view.line_start import (
+    OPEN,
+    checked_scene,
+    refuse_absurd,
+    spreads,
+    triangulated,
+)
 from epigauge.multi_view.line_tracks import LineTracks
 from epigauge.multi_view.tracks import Tracks
 from epigauge.multi_view.verdicts.front import BEHIND
@@ -37,6 +44,12 @@ Array = NDArray[np.float64]
 
 #: Methods that leave all parameters free, as lines need.
 METHODS = ("covariant", "levenberg", "marquardt")
+
+#: A segment farther from its line than this, in standard deviations, is one of another line.
+_WRONG = 12.0
+
+#: Noise below this, in those deviations, is rounding.
+_EXACT = 1e-4
 
 
 class LineJob(NamedTuple):
@@ -89,7 +102,7 @@ def line_job(
         fixed_points=fixed_points,
         priors=None,
     )
-    first = _first_lines(lines, start, table)
+    first = _first_lines(lines, start, segments, table)
     home = normal_frame(job.cameras, job.points)
     cameras, points = home.apply(job.cameras, job.points)
     begin = Estimate(cameras, points, others=(home.lines(first),))
@@ -120,10 +133,13 @@ def _sizes(problem: BundleProblem, at: Estimate, whitening: Array | None) -> lis
     return [np.linalg.norm(part, axis=0) for part in parts]
 
 
-def _first_lines(lines: LineTracks, start: MetricReconstruction, table: Table) -> Array:
-    """Return the lines of the start, or triangulated ones."""
+def _first_lines(
+    lines: LineTracks, start: MetricReconstruction, segments: Segments, table: Table
+) -> Array:
+    """Return the lines of the start, or triangulated ones where there are none or wild ones."""
     if start.lines is None:
         found, deviations = triangulated(lines, start, table)
+        refuse_absurd("lines", lines, start, found, table)
         bad = np.flatnonzero(~np.isfinite(deviations))
         if len(bad):
             was = f"have lines that no views determine: {', '.join(map(str, bad[:5]))}"
@@ -133,7 +149,23 @@ def _first_lines(lines: LineTracks, start: MetricReconstruction, table: Table) -
     if len(start.lines) != lines.n_lines:
         was = f"has {len(start.lines)} lines"
         raise ArgumentError("start", was, f"{lines.n_lines}, as lines; or none")
-    return start.lines
+    model, count = camera_model(start.cameras.model), (start.n_views, lines.n_lines)
+    linearizer = LineLinearizer.of(segments, model, table, count)
+    sizes = lengths(linearizer, start.vectors, start.lines)
+    bound = BEYOND * usual(sizes)
+    if (sizes <= bound).all():
+        return start.lines
+    found, deviations = triangulated(lines, start, table)
+
+    def cost(rows: Array) -> Array:
+        """Return the costs of lines, what is beyond counted alike."""
+        capped = np.minimum(lengths(linearizer, start.vectors, rows), bound) ** 2
+        return np.asarray(np.bincount(lines.line, capped, minlength=lines.n_lines), np.float64)
+
+    better = np.isfinite(deviations) & (cost(found) + bound**2 < cost(start.lines))
+    chosen = np.where(better[:, None], found, start.lines)
+    refuse_absurd("start", lines, start, chosen, table)
+    return chosen
 
 
 def adjusted_lines(
@@ -184,14 +216,16 @@ def adjusted_lines(
         counts = np.concatenate([tracks.weights > 0.0, np.ones(len(lines), np.bool_)])
         sizes = sizes[counts]
         share = max(1.0 - rank / max(2 * len(sizes), 1), 1e-3)
-        usual = median(sizes) / 1.1774 / float(np.sqrt(share))
+        noise = median(sizes) / 1.1774 / float(np.sqrt(share))
         middles = 0.5 * (lines.segments[:, :2] + lines.segments[:, 2:])
         measured = np.concatenate([tracks.xy, middles])
         if loss == "linear":
-            raised.update(gross_flags(TailOfArrays(sizes, measured[counts]), usual))
+            raised.update(gross_flags(TailOfArrays(sizes, measured[counts]), noise))
+            if (of_lines > _WRONG * max(noise, _EXACT)).any():
+                raised.add("wrong segments")
         if diagnosis.missing:
             raised.add("undetermined")
-        if (usual * spreads(system.normal.others[0].V) > OPEN).any():
+        if (noise * spreads(system.normal.others[0].V) > OPEN).any():
             raised.add("open lines")
     line_fun, fun = np.ascontiguousarray(line_fun.T), tracks.xy - predicted
     flags = ordered(raised)
