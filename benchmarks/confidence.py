@@ -5,8 +5,8 @@
 Sets are files of many pairs with true F; the pairs of the directory have a true F, or are compared
 with the maximum-likelihood F of the matches that are marked as right; the trials are simulated:
 scenes of all kinds, and that of Bartoli & Sturm 2004 with wrong matches among them. Each set is
-held out in turn: the constants are fitted to the others, all sets weighing alike, and the
-probabilities of its pairs at the bounds are sorted into ten bins. The expected calibration error is
+held out in turn: the constants are fitted to the others, and the probabilities of its pairs at the
+bounds are sorted into ten bins. The expected calibration error is
 the mean difference between the promise of a bin and how often it was kept. Last, the constants
 fitted to all sets, for `epigauge.two_view.confidence`.
 """
@@ -107,10 +107,18 @@ def promised(some: list[Case], fitted: Constants, px: Array) -> Array:
     return probability_below(px, error, wrong, fitted.width)
 
 
-def fitted_to(groups: list[list[Case]]) -> Constants:
-    """Return the constants of highest likelihood, all groups weighing alike."""
-    some = [case for group in groups for case in group]
-    weights = np.concatenate([np.full(len(group), 50.0 / len(group)) for group in groups])
+def fitted_to(groups: dict[str, list[Case]]) -> Constants:
+    """Return the constants of highest likelihood; a simulated group weighs as three measured ones.
+
+    Only simulated matches agree by chance often enough to tell the odds of that.
+    """
+    some = [case for group in groups.values() for case in group]
+    weights = np.concatenate(
+        [
+            np.full(len(group), (150.0 if name.startswith("simulated") else 50.0) / len(group))
+            for name, group in groups.items()
+        ]
+    )
     error = np.array([error for _, error in some])
 
     def cost(free: Array) -> float:
@@ -158,11 +166,11 @@ def main() -> None:
     print("|---|---|" + "---|" * (len(BOUNDS_PX) + 1))
     found = []
     for name, own in groups.items():
-        others = [group for other, group in groups.items() if other != name]
+        others = {other: group for other, group in groups.items() if other != name}
         found.append(checked(name, own, fitted_to(others)))
     said, kept = (np.concatenate(parts) for parts in zip(*found, strict=True))
     error, rows = reliability(said, kept)
-    best = fitted_to(list(groups.values()))
+    best = fitted_to(groups)
     fresh = range(arguments.trials, 2 * arguments.trials)
     checked("all kinds, other seeds", cases([simulated(seed) for seed in fresh]), best)
     print(f"\nExpected calibration error of the sets held out, all bounds: {error:.3f}\n")
