@@ -376,7 +376,8 @@ static void plane_and_parallax(search_t *s)
     double H[9], highest = 0.0, *squared = s->work + 2 * s->m;
     const double off = 9.0 * s->options->scale;
     ptrdiff_t n = 0;
-    if (plane(s, H) < 7)
+    const ptrdiff_t on = plane(s, H);
+    if (on < 7 || (double)on < s->options->dominant * (double)s->near.m)
         return;
     eg_homography_squared(s->m, H, s->q1, s->q2, squared);
     ptrdiff_t *rows = malloc((size_t)s->m * sizeof *rows);
@@ -412,23 +413,31 @@ static void plane_and_parallax(search_t *s)
 }
 
 /* Share of the matches near one in either image that are near it in both: right matches have
-   neighbours that move alike. Near is within `reach` in each coordinate. */
-EG_EXPORT void eg_neighbours(ptrdiff_t m, const double *q, double reach, double *share)
+   neighbours that move alike. Near is within `reach` in each coordinate, in single precision.
+   Returns 0 where memory ran out. */
+EG_EXPORT int eg_neighbours(ptrdiff_t m, const double *q, double reach, double *share)
 {
-    const double *x1 = q, *y1 = q + m, *x2 = y1 + m, *y2 = x2 + m;
+    const float limit = (float)reach;
+    float *x1 = malloc((size_t)(4 * m + 1) * sizeof *x1), *y1 = x1 + m, *x2 = y1 + m, *y2 = x2 + m;
+    if (!x1)
+        return 0;
+    for (ptrdiff_t i = 0; i < 4 * m; ++i)
+        x1[i] = (float)q[i];
     for (ptrdiff_t i = 0; i < m; ++i) {
-        const double a = x1[i], b = y1[i], c = x2[i], d = y2[i];
-        double one = 0.0, two = 0.0, both = 0.0;
+        const float a = x1[i], b = y1[i], c = x2[i], d = y2[i];
+        int one = 0, two = 0, both = 0;
         EG_SUM(one, two, both)
         for (ptrdiff_t j = 0; j < m; ++j) {
-            const double first = fabs(x1[j] - a) < reach && fabs(y1[j] - b) < reach ? 1.0 : 0.0;
-            const double second = fabs(x2[j] - c) < reach && fabs(y2[j] - d) < reach ? 1.0 : 0.0;
+            const int first = (fabsf(x1[j] - a) < limit) & (fabsf(y1[j] - b) < limit);
+            const int second = (fabsf(x2[j] - c) < limit) & (fabsf(y2[j] - d) < limit);
             one += first;
             two += second;
-            both += first * second;
+            both += first & second;
         }
-        share[i] = (both - 1.0) / (one + two - 1.0);
+        share[i] = ((double)both - 1.0) / ((double)(one + two) - 1.0);
     }
+    free(x1);
+    return 1;
 }
 
 /* Spread over the better half of the matches. */

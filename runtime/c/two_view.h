@@ -111,6 +111,7 @@ typedef struct {
     int steps, widths;             /* of the local optimisation */
     double scale, floor2;          /* of distances, and a part of its square that is rounding */
     double patience, width[4];     /* more samples than one is good; widths in scales */
+    double dominant;               /* share of those that agree, on a plane that is looked into */
 } eg_search_options;
 
 /* The mixture of right and wrong matches, as in the structure of native.py. */

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -19,11 +19,12 @@ from epigauge._results import Result
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._common import PathLike
 from epigauge.two_view.conditioning import condition
+from epigauge.two_view.consensus import Consensus
 from epigauge.two_view.essential import Calibrated
-from epigauge.two_view.geometry import reprojection_distances
 from epigauge.two_view.homography import fit_homography, robust_homography
-from epigauge.two_view.refine import refine_fundamental
+from epigauge.two_view.refine import plan_of
 from epigauge.two_view.robust import RobustResult, estimated
+from epigauge.two_view.solve import Matches, minimize
 
 if TYPE_CHECKING:
     from epigauge.io.colmap_raw import Geometry, RawPair
@@ -63,6 +64,9 @@ _AT_BORDER, _BORDER, _TOGETHER_PX = 0.7, 0.1, 4.0
 #: A lens bends the points when it moves them by more than this many deviations of their noise, and
 #: by more than so many pixels.
 _BENT, _BENT_PX = 1.0, 0.5
+
+#: Ratio of the two singular values of E below which it has rank one.
+_RANK_ONE = 16.0 * np.finfo(float).eps
 
 #: Pairs a task, tasks that wait, and pairs that are stored at a time.
 _PART, _WAITING, _STORED = 16, 16, 256
@@ -323,7 +327,7 @@ def _verified(
     if not {"planar scene", "still camera", "pure rotation"}.isdisjoint(flags):
         config, H, on = _homography(pair, result)
         return told(config, on, noise, note, F=result.F, H=H)
-    E = _essential(pair, result)
+    E = _essential(pair, result, backend)
     if E is not None:
         return told(_CALIBRATED, E[2], noise, note, F=E[0], E=E[1])
     return told(_UNCALIBRATED, inlier, noise, note, F=result.F)
@@ -376,23 +380,29 @@ def _homography(pair: RawPair, result: RobustResult) -> tuple[int, Array, Mask]:
     return code, H / np.linalg.norm(H), inlier
 
 
-def _essential(pair: RawPair, result: RobustResult) -> tuple[Array, Array, Mask] | None:
+def _essential(
+    pair: RawPair, result: RobustResult, backend: str
+) -> tuple[Array, Array, Mask] | None:
     """Return F, E and inliers of calibrated cameras; None where E does not explain them."""
     if pair.K1 is None or pair.K2 is None:
         return None
-    x1, x2 = pair.x1[result.used], pair.x2[result.used]
-    try:
-        found = refine_fundamental(x1, x2, result.F, essential=True, K1=pair.K1, K2=pair.K2)
-        distances = reprojection_distances(found.F, pair.x1, pair.x2)[0]
-    except (
-        ArgumentError
-    ):  # points so far off for these cameras that F has rank 1 in double precision
-        return None
-    inlier = result.inlier & (np.abs(distances) <= result.threshold_px)
+    F0, x1, x2 = result.F, pair.x1[result.used], pair.x2[result.used]
+    matches = Matches.of(x1, x2, np.ones(len(x1)), F0, kernels.table(backend))
+    E0 = pair.K2.T @ F0 @ pair.K1
+    values = np.linalg.svd(E0, compute_uv=False)
+    if not values[1] > _RANK_ONE * values[0]:
+        return None  # points so far off for these cameras that E has rank 1 in double precision
+    options = replace(plan_of({"backend": backend}).options, calibration=(pair.K1, pair.K2))
+    found = minimize(matches, options, matches.frame.from_pixels(F0)).F
+    q1, q2 = matches.frame.forward(pair.x1, pair.x2)
+    signed = Consensus(matches.table, q1, q2).measured(found)[0]
+    with np.errstate(invalid="ignore"):
+        inlier = result.inlier & (matches.frame.scale * np.abs(signed) <= result.threshold_px)
     if np.count_nonzero(inlier) < _BY_E * np.count_nonzero(result.inlier):
         return None
-    assert found.E is not None
-    return found.F, found.E, inlier
+    F = matches.frame.to_pixels(found)
+    E = pair.K2.T @ F @ pair.K1
+    return F, E / np.linalg.norm(E), inlier
 
 
 def _joined(

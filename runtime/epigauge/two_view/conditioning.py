@@ -59,7 +59,7 @@ class Conditioning:
 
     def to_pixels(self, F: Array) -> Array:
         """Return F for pixels, with unit Frobenius norm."""
-        pixels = (self.entry_map() @ F.ravel()).reshape(3, 3)
+        pixels = self._to_units(self.origin2).T @ F @ self._to_units(self.origin1)
         return np.asarray(pixels / np.linalg.norm(pixels))
 
     def entry_map(self) -> Array:

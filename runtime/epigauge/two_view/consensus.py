@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,7 +143,11 @@ class Consensus:
         ones = np.ones((1, q1.shape[1]))
         self.h1, self.h2 = np.vstack([q1, ones]), np.vstack([q2, ones])
         self.few = slice(None, None, -(-q1.shape[1] // _FEW))
-        self.products = (self.h2[:, None, self.few] * self.h1[None, :, self.few]).reshape(9, -1)
+
+    @cached_property
+    def products(self) -> Array:
+        """Coefficients (9, few) of the equations of the few matches by vect(F)."""
+        return (self.h2[:, None, self.few] * self.h1[None, :, self.few]).reshape(9, -1)
 
     def judge(self, F: Array, sigma: float, share: float = 0.5, extent: float = RANGE) -> Agreement:
         """Return the agreement with F, sigma and share being fitted from the values given.

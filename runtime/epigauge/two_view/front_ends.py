@@ -42,6 +42,9 @@ _MANY = 400
 #: Then wrong matches are looked at within so many scales, for how dense they are there.
 _EXTENT = 20.0
 
+#: An F found sharply among matches whose noise is up to so many scales may climb to a sharp one.
+_BLUNT = 4.0
+
 #: Right matches that are more than those which fit by chance.
 _ENOUGH = 14
 
@@ -128,11 +131,15 @@ def _native(
             continue
         if scale == SCALES[0] and q1.shape[1] >= _MANY:
             sharp = consensus.judge(found.F, scale, extent=_EXTENT * scale)
-            d = np.abs(sharp.signed[few])
-            if sharp.sigma <= 2.0 * scale and _is_sharp(
-                kernels, q1, q2, sharp, d, _DEVIATIONS * scale
-            ):
+            if _is_sharp(kernels, q1, q2, sharp, sharp.signed[few], scale):
                 return sharp
+            if sharp.sigma <= _BLUNT * scale:
+                climbed = consensus.climb(consensus.judge(found.F, scale))
+                own = max(scale, climbed.sigma)
+                if own <= _BLUNT * scale and _is_sharp(
+                    kernels, q1, q2, climbed, climbed.signed[few], own
+                ):
+                    return climbed
         agreements.append(consensus.judge(found.F, scale))
     if not agreements:
         return None
@@ -142,9 +149,12 @@ def _native(
 
 
 def _is_sharp(
-    kernels: Table, q1: Array, q2: Array, found: Agreement, d: Array, limit: float
+    kernels: Table, q1: Array, q2: Array, found: Agreement, signed: Array, scale: float
 ) -> bool:
-    """Tell whether distances end within a limit, and that many do so is no accident."""
+    """Tell whether distances end within some scales, and that many do so is no accident."""
+    if found.sigma > 2.0 * scale:
+        return False
+    d, limit = np.abs(signed), _DEVIATIONS * scale
     # Seven matches may be within any limit
     core, hits, around = (
         np.count_nonzero(d <= bound) - 7

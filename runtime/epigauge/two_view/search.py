@@ -54,10 +54,13 @@ SCALES, _FLOOR = (0.003, 0.02, 0.1), 0.01
 
 #: Samples at most and at least, and how many times more than give one without wrong matches: seven
 #: right ones with noise are seldom good enough.
-_SAMPLES, _LEAST, _PATIENCE = 20_000, 1_000, 5.0
+_SAMPLES, _LEAST, _PATIENCE = 20_000, 768, 5.0
 
 #: Threes of matches that a plane is tried from, and twos off it that F is.
 _PLANES, _PAIRS = 64, 512
+
+#: A plane with less than this share of the matches that agree leaves F no freedom.
+_DOMINANT = 0.2
 
 #: Where no more than this share of the matches that agree are off a plane, by so many standard
 #: deviations of the noise, F may be any of the plane. All of these fit its matches alike but for
@@ -89,6 +92,7 @@ class _Options(ctypes.Structure):
         *((name, ctypes.c_int) for name in ("planes", "pairs", "steps", "widths")),
         *((name, ctypes.c_double) for name in ("scale", "floor2", "patience")),
         ("width", ctypes.c_double * 4),
+        ("dominant", ctypes.c_double),
     )
 
 
@@ -98,7 +102,7 @@ def _functions() -> tuple[Any, Any]:
     pointer, size = ctypes.c_void_p, ctypes.c_ssize_t
     find, near = library().eg_search, library().eg_neighbours
     find.argtypes, find.restype = [size, *[pointer] * 5], size
-    near.argtypes, near.restype = [size, pointer, ctypes.c_double, pointer], None
+    near.argtypes = [size, pointer, ctypes.c_double, pointer]
     return find, near
 
 
@@ -137,10 +141,12 @@ def ranked(kernels: Table, q1: Array, q2: Array) -> Rows:
     q, m = np.concatenate([q1, q2]), q1.shape[1]
     share = np.empty(m)
     if kernels.compiled:
-        _functions()[1](m, address(q), _REACH, address(share))
+        if not _functions()[1](m, address(q), _REACH, address(share)):
+            raise MemoryError(f"no room for {m} matches")
     else:
+        q = q.astype(np.float32)
         for i in range(m):
-            near = np.abs(q - q[:, i : i + 1]) < _REACH
+            near = np.abs(q - q[:, i : i + 1]) < np.float32(_REACH)
             one, two = near[0] & near[1], near[2] & near[3]
             both, ends = np.count_nonzero(one & two), np.count_nonzero(one) + np.count_nonzero(two)
             share[i] = (both - 1.0) / (ends - 1.0)
@@ -181,7 +187,7 @@ def search(
         return _Search(kernels, q, order, seed, scale).run()
     width = (ctypes.c_double * 4)(*_WIDTHS)
     numbers = (seed, _SAMPLES, _LEAST, _PLANES, _PAIRS, _STEPS, len(_WIDTHS))
-    options = _Options(*numbers, scale, _FLOOR, _PATIENCE, width)
+    options = _Options(*numbers, scale, _FLOOR, _PATIENCE, width, _DOMINANT)
     order = None if order is None else np.ascontiguousarray(order, dtype=np.intp)
     F, score = np.zeros((3, 3)), np.zeros(1)
     samples = _functions()[0](
@@ -323,11 +329,11 @@ class _Search:
                 most = self.needed()
         return done
 
-    def plane(self) -> tuple[int, Array]:
-        """Return how many matches that agree are on one plane, and its homography."""
+    def plane(self) -> tuple[int, int, Array]:
+        """Return how many matches are on one plane, of how many that agree, and its homography."""
         rows = self.near(self.F, 3.0 * self.scale)
         if len(rows) < 7:
-            return 0, np.eye(3)
+            return 0, len(rows), np.eye(3)
         limit = 3.0 * self.scale * 2.0**0.5
         e2 = self.kernels.epipole(self.F)
         e2 /= np.linalg.norm(e2)
@@ -353,12 +359,13 @@ class _Search:
         minors = np.cross(np.roll(A, -1, axis=0), np.roll(A, -2, axis=0))
         if (determinant := A[0] @ minors[0]) > 1e-12 * np.prod(np.diag(A)):
             v = minors.T @ b / determinant
-        return int(counts[best]), np.cross(e2, self.F, axisb=0, axisc=0) + np.outer(e2, v)
+        H = np.cross(e2, self.F, axisb=0, axisc=0) + np.outer(e2, v)
+        return int(counts[best]), len(rows), H
 
     def plane_and_parallax(self) -> None:
         """Try F = [e']x H of the plane's homography and two matches off it."""
-        count, H = self.plane()
-        if count < 7:
+        count, agree, H = self.plane()
+        if count < max(7, _DOMINANT * agree):
             return
         q1, q2 = self.q[:2], self.q[2:]
         squared = self.kernels.homography_squared(H, q1, q2)
