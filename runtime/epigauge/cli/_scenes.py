@@ -38,7 +38,6 @@ from epigauge.io.line_files import arrays_of_lines
 from epigauge.io.output import arrays_of_result
 from epigauge.io.scene_files import is_scene_file, scene_content
 from epigauge.multi_view.display import Display, display
-from epigauge.multi_view.line_segments import line_pieces
 
 #: Views up to which standard deviations are told unasked, and rows of their table.
 _TOLD, _ROWS = 200, 24
@@ -259,7 +258,7 @@ class _SceneAnswer:
     def pieces(self) -> NDArray[np.float64] | None:
         """What is seen of each line, (L, 2, 3)."""
         lines = self.job.lines
-        return None if lines is None else line_pieces(lines, self.scene)
+        return None if lines is None else lines.pieces(self.scene)
 
     @cached_property
     def frame(self) -> Display:
@@ -320,7 +319,9 @@ class _SceneAnswer:
             return
         from epigauge.plots import plot_bundle, save_figure
 
-        save_figure(plot_bundle(self.result, tracks, title, frame=self.frame), path)
+        save_figure(
+            plot_bundle(self.result, tracks, title, frame=self.frame, pieces=self.pieces), path
+        )
 
     def draw_precision(self, path: Path) -> None:
         """Draw how sure it is."""

@@ -71,6 +71,17 @@ class Display:
     T: Array
     y_up: bool
 
+    def placed(self, X: Array) -> Array:
+        """Return where points (k, 3) of the reconstruction are shown, (k, 3)."""
+        Q = np.linalg.solve(self.T, np.concatenate([X, np.ones((len(X), 1))], axis=1).T).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(Q[:, :3] / Q[:, 3:])
+
+    def placed_pieces(self, pieces: Array) -> Array:
+        """Return where pieces of lines (L, 2, 3) are shown, without those that go far away."""
+        ends = self.placed(pieces.reshape(-1, 3)).reshape(-1, 2, 3)
+        return ends[(np.abs(ends) < FAR_POINT).all(axis=(1, 2))]
+
     @property
     def distorted(self) -> bool:
         """Whether so many cameras look unusual that the scene must be distorted, or they are."""

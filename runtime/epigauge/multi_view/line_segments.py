@@ -99,8 +99,10 @@ def line_pieces(lines: LineTracks, reconstruction: MetricReconstruction) -> Arra
     From each end point's line of sight the nearest place on the line is taken; of the places of all
     views the middle half of the views decides where the piece begins and ends.
     """
-    assert reconstruction.lines is not None
     segments = segments_of(lines, reconstruction)
+    if reconstruction.lines is None or len(reconstruction.lines) != lines.n_lines:
+        count = 0 if reconstruction.lines is None else len(reconstruction.lines)
+        raise ArgumentError("reconstruction", f"has {count} lines", f"{lines.n_lines}")
     K = reconstruction._calibrations()[segments.view]
     R, centres = reconstruction.R[segments.view], reconstruction.centres[segments.view]
     n, v = reconstruction.lines[segments.line, :3], reconstruction.lines[segments.line, 3:]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,9 @@ from epigauge._arguments import MAX_PX, as_array, as_count, as_real
 from epigauge._results import Result
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.labels import view_names
+
+if TYPE_CHECKING:
+    from epigauge.cameras import MetricReconstruction
 
 __all__ = ["LineTracks"]
 
@@ -119,6 +122,35 @@ class LineTracks(Result):
         self.names = None if names is None else view_names(names, self.n_lines)
         for array in (self.order, self.view, self.line, self.segments, self.spread):
             array.setflags(write=False)
+
+    def pieces(self, reconstruction: MetricReconstruction) -> Array:
+        """Return what the segments show of each line, to be drawn.
+
+        Parameters
+        ----------
+        reconstruction : MetricReconstruction
+            Cameras and lines.
+
+        Returns
+        -------
+        ndarray, shape (L, 2, 3)
+            Ends of a piece of each line: a quarter of the views sees more at either end.
+
+        Raises
+        ------
+        ArgumentError
+            If it has other lines, or fewer views.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(seed=1)
+        >>> scene.line_tracks.pieces(scene.true).shape
+        (60, 2, 3)
+        """
+        from epigauge.multi_view.line_segments import line_pieces
+
+        return line_pieces(self, reconstruction)
 
     def __len__(self) -> int:
         """Return the number of observations."""

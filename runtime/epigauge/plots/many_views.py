@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from epigauge.multi_view.adjust import BundleResult
 from epigauge.multi_view.display import Display, camera_spacing, display, is_sequence
@@ -14,6 +14,7 @@ from epigauge.plots._style import BLUE, RED, draw_history, finish, heading, new_
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
 __all__ = ["plot_bundle"]
@@ -21,13 +22,18 @@ __all__ = ["plot_bundle"]
 Array = NDArray[np.float64]
 
 _WIDTH = 11.0  # inches
-_CAMERA = "#c25e00"
+_CAMERA, _EDGE = "#c25e00", BLUE
 _PYRAMID = (0.1, 0.35)  # length of a camera, in usual distances of a point from the middle
 _STRAY = 0.005  # share of the points that a picture may leave out at either end of an axis
 
 
 def plot_bundle(
-    result: BundleResult, tracks: Tracks, title: str = "", *, frame: Display | None = None
+    result: BundleResult,
+    tracks: Tracks,
+    title: str = "",
+    *,
+    frame: Display | None = None,
+    pieces: ArrayLike | None = None,
 ) -> Figure:
     """Show points and cameras from three sides, the residuals, and the convergence.
 
@@ -47,6 +53,8 @@ def plot_bundle(
         What to call them.
     frame : Display, optional
         Where to show them; by default ``display(result.reconstruction, tracks)``.
+    pieces : array_like, shape (L, 2, 3), optional
+        Ends of pieces of lines, to be drawn, too: `LineTracks.pieces`.
 
     Returns
     -------
@@ -69,26 +77,27 @@ def plot_bundle(
     if result.loss_scale_px:
         text += f" (robust loss of scale {result.loss_scale_px:.2g} px)"
     heading(figure, text, "" if result.success else result.message)
+    ends = np.zeros((0, 2, 3)) if pieces is None else shown.placed_pieces(np.asarray(pieces))
     grid = figure.add_gridspec(3, 6, height_ratios=(2.6, 2.6, 2.9))
     oblique = figure.add_subplot(grid[:2, :4])
-    _draw_scene(oblique, shown, _OBLIQUE, floor=True)
+    _draw_scene(oblique, shown, _OBLIQUE, ends, floor=True)
     if shown.distorted:
         caption = "Points and cameras (distorted: in no basis do all cameras look usual)"
     else:
         caption = "Points and cameras (to look at; no calibration)"
     oblique.set_title(caption, loc="left", fontsize=11)
-    _draw_legend(oblique)
+    _draw_legend(oblique, bool(len(ends)))
     for row, side, name in ((0, _ABOVE, "From above"), (1, _SIDE, "From the side")):
         axes = figure.add_subplot(grid[row, 4:])
-        _draw_scene(axes, shown, side)
+        _draw_scene(axes, shown, side, ends)
         axes.set_title(name, loc="left", fontsize=11)
     _draw_residuals(figure.add_subplot(grid[2, :3]), result.fun.ravel())
     draw_history(figure.add_subplot(grid[2, 3:]), result.history)
     return figure
 
 
-def _draw_scene(axes: Axes, shown: Display, side: Array, floor: bool = False) -> None:
-    """Draw points and cameras as seen from one side, near things over far ones.
+def _draw_scene(axes: Axes, shown: Display, side: Array, ends: Array, floor: bool = False) -> None:
+    """Draw points, pieces of lines and cameras as seen from one side, near things over far ones.
 
     With a floor they are seen in perspective and stand on a grid; else without it, to scale.
     """
@@ -118,6 +127,8 @@ def _draw_scene(axes: Axes, shown: Display, side: Array, floor: bool = False) ->
     x, y = seen(points)[order, :2].T
     size = _size(len(points)) * (1.0 if floor else 0.5)
     axes.scatter(x, y, c=depth, cmap="viridis", vmin=limits[0], vmax=limits[1], s=size, lw=0.0)
+    if len(ends):
+        axes.add_collection(_edges(seen(ends)[..., :2]))
     _draw_cameras(axes, seen(shown.centres)[:, :2], seen(rims)[..., :2], is_sequence(shown.centres))
     # The view is fitted to these, not to stray points.
     around = seen(framed)[:, :2]
@@ -128,13 +139,21 @@ def _draw_scene(axes: Axes, shown: Display, side: Array, floor: bool = False) ->
         spine.set_color("0.85")
 
 
-def _draw_legend(axes: Axes) -> None:
+def _edges(ends: Array) -> LineCollection:
+    from matplotlib.collections import LineCollection
+
+    return LineCollection(list(ends), colors=_EDGE, lw=1.2, zorder=2)
+
+
+def _draw_legend(axes: Axes, lines: bool) -> None:
     """Say what the colours are."""
     from matplotlib import colormaps
 
     dot: dict[str, Any] = {"ls": "", "marker": "o", "ms": 5}
     for share, name in ((0.0, "near points"), (1.0, "far points")):
         axes.plot([], [], color=colormaps["viridis"](share), label=name, **dot)
+    if lines:
+        axes.plot([], [], color=_EDGE, lw=1.2, label="lines")
     axes.plot([], [], color=_CAMERA, lw=1.2, label="cameras")
     axes.legend(fontsize=8, frameon=False, loc="lower right")
 

@@ -27,7 +27,6 @@ _PYRAMID = (0.06, 0.4)  # length of a camera, in usual distances of a point from
 _ELLIPSOID = 0.03  # half-axis of a usual ellipsoid, in usual distances of a point from the middle
 _DOT = (2.0, 5.5)  # diameter of a point, in pixels of the screen
 _STRAY = 0.005  # share of the points left out at either end when the view is fitted
-_FAR = 8.0  # lines that go farther from the middle are not drawn
 _FITTED = 500  # points that the view is fitted to
 
 
@@ -119,7 +118,8 @@ def save_viewer(
     data = _data(shown, tracks, result.fun, views, points)
     kept = np.asarray(data.pop("kept"))
     data["pictures"] = [base64.b64encode(picture).decode("ascii") for picture in pictures]
-    data["lines"] = [] if pieces is None else _pieces(shown, np.asarray(pieces))
+    ends = np.zeros((0, 2, 3)) if pieces is None else shown.placed_pieces(np.asarray(pieces))
+    data["lines"] = [_rounded(row, 4) for row in ends.reshape(-1, 6)]
     data["spread"] = None if covariance is None else _spread(shown, covariance, kept)
     save_page(path, "viewer", parts, data)
 
@@ -214,14 +214,6 @@ def _spread(
         six = blocks[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         found[name] = [float(f"{value:.4g}") for value in six.ravel()]
     return found
-
-
-def _pieces(shown: Display, pieces: Array) -> list[list[float]]:
-    """Return the ends of pieces of lines where they are shown, six numbers each."""
-    ends = np.concatenate([pieces.reshape(-1, 3), np.ones((2 * len(pieces), 1))], axis=1)
-    there = np.linalg.solve(shown.T, ends.T).T
-    rows = (there[:, :3] / there[:, 3:]).reshape(-1, 6)
-    return [_rounded(row, 4) for row in rows[(np.abs(rows) < _FAR).all(axis=1)]]
 
 
 def _without_strays(X: Array) -> Array:
