@@ -9,7 +9,7 @@ import epigauge as eg
 import numpy as np
 import pytest
 from calibration import SIZE, tracks_of
-from epigauge.images.pairwise import _matched
+from epigauge.images.pairwise import _matched, _ranked
 from epigauge.images.tracks import NoTracks, _united
 
 pytest.importorskip("cv2", reason="estimate_fundamental needs a front end")
@@ -152,3 +152,27 @@ def test_bad_matches_are_named(change: dict, named: str) -> None:
     with pytest.raises(eg.ArgumentError) as error:
         eg.PairwiseMatches(**fields)
     assert error.value.argument == named
+
+
+def test_ranked_pairs_are_those_with_most_in_common() -> None:
+    rng = np.random.default_rng(0)
+    scenes = rng.normal(size=(2, 300, 32))
+    strongest = []
+    for k in range(30):  # of two scenes in turn; of each image two thirds of the features
+        own = scenes[k % 2][rng.permutation(300)[:200]]
+        own = own + 0.05 * rng.normal(size=own.shape)
+        strongest.append((own / np.linalg.norm(own, axis=1)[:, None]).astype(np.float32))
+    chosen = _ranked(strongest, 0.8)
+    assert all((i - j) % 2 == 0 for i, j in chosen)
+    partners = np.bincount(np.ravel(chosen), minlength=30)
+    assert partners.min() >= 12
+    assert len(chosen) < 30 * 29 // 2
+    # A few images: all of them, in order.
+    assert _ranked(strongest[:5], 0.8) == [(i, j) for i in range(5) for j in range(i + 1, 5)]
+
+
+def test_threads_verify_the_same() -> None:
+    matches, _ = pairwise()
+    one, two = (eg.build_tracks(matches, workers=workers) for workers in (1, 2))
+    assert np.array_equal(one.xy, two.xy)
+    assert one.source == two.source

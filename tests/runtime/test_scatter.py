@@ -6,6 +6,7 @@ import epigauge as eg
 import numpy as np
 import pytest
 from calibration import SIZE, tracks_of
+from epigauge.metric.deviation import beside_the_model
 from epigauge.uncertainty.scatter import scatter_of
 
 FOCAL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -57,3 +58,52 @@ def test_two_views_have_no_scatter() -> None:
     known = eg.covariance(tracks, found, refine="f")
     assert isinstance(known, eg.MetricCovariance)
     assert scatter_of(known, FOCAL).factor == 1.0
+
+
+def _seen_by(params: list[float], seed: int, noise_px: float = 0.1) -> eg.Tracks:
+    """Return tracks of a made-up walk with another lens."""
+    tracks, scene = tracks_of(seed=seed, n_views=10, n_points=400)
+    cameras = eg.Cameras("OPENCV", [params], np.zeros(10, dtype=int))
+    xy = eg.MetricReconstruction(scene.R, scene.t, scene.X, cameras).project(tracks)
+    noise = np.random.default_rng(seed).normal(0.0, noise_px, xy.shape)
+    return eg.Tracks(tracks.view, tracks.point, xy + noise)
+
+
+def test_what_a_richer_model_says_otherwise_counts() -> None:
+    # Residuals of two radial terms taken for one do not contradict one another between views.
+    tracks = _seen_by([900.0, 900.0, 399.5, 299.5, -0.3, 0.3, 0.0, 0.0], seed=2)
+    found = eg.metric_upgrade(tracks, image_size=SIZE)
+    assert isinstance(found.covariance, eg.MetricCovariance)
+    beside = beside_the_model(tracks, found.covariance, None)
+    assert beside[0] > 0.5 * abs(found.focal_px - 900.0) > 0.5
+    assert abs(found.focal_px - 900.0) < 3.0 * found.focal_std_px
+    # The model itself, and what contains it, have nothing beside.
+    right = eg.metric_upgrade(tracks, image_size=SIZE, camera="OPENCV")
+    assert isinstance(right.covariance, eg.MetricCovariance)
+    assert beside_the_model(tracks, right.covariance, None)[0] == 0.0
+
+
+def test_a_richer_model_of_a_plain_lens_moves_by_noise_alone() -> None:
+    beside, noise = [], []
+    for seed in range(6):
+        tracks = _seen_by([900.0, 900.0, 399.5, 299.5, -0.05, 0.0, 0.0, 0.0], seed, noise_px=0.5)
+        found = eg.metric_upgrade(tracks, image_size=SIZE)
+        assert isinstance(found.covariance, eg.MetricCovariance)
+        noise.append(np.sqrt(found.covariance.intrinsics(0)[0, 0]))
+        beside.append(beside_the_model(tracks, found.covariance, None)[0])
+    # A chi^2 of one number exceeds its mean in a third of the cases, and seldom by much.
+    assert np.mean(np.array(beside) == 0.0) >= 0.5
+    assert np.median(beside) < np.median(noise)
+
+
+def test_noise_alone_decides_what_is_undetermined(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A lens far from its model widens the deviation, and the flag says it is weak; nothing is open.
+    tracks, _ = tracks_of(seed=0, noise_px=0.3, n_views=8)
+    monkeypatch.setattr(
+        "epigauge.metric.upgrade.known_to", lambda known, unit: (np.array([400.0]), 300.0, True)
+    )
+    found = eg.metric_upgrade(tracks, image_size=SIZE)
+    assert found.focal_std_px >= 400.0
+    assert {"weak focal length", "model error"} <= set(found.flags)
+    assert not {"undetermined", "pure translation", "pure rotation"} & set(found.flags)
+    assert found.success

@@ -63,7 +63,7 @@ def scene(
         ),
     ] = "auto",
     camera: Annotated[str, typer.Option(help="Camera model.")] = "SIMPLE_RADIAL",
-    pairs: Annotated[str, typer.Option(help="Pairs to match: all or sequential.")] = "all",
+    pairs: Annotated[str, typer.Option(help="Pairs to match: all, sequential or ranked.")] = "all",
     max_features: Annotated[int, typer.Option(help="Features of each photograph.")] = 5000,
     exif_focal: Annotated[
         bool,
@@ -72,6 +72,7 @@ def scene(
             help="Take focal lengths in EXIF data for known to ten percent; never needed.",
         ),
     ] = False,
+    workers: Annotated[int, typer.Option(help="Threads that verify pairs and adjust.")] = 1,
     cache: Annotated[
         Path | None, typer.Option(help="NPZ file for features and matches, to begin there again.")
     ] = None,
@@ -100,10 +101,10 @@ def scene(
             if isinstance(found, list):
                 options = {"pairs": pairs, "max_features": max_features, "cache": cache}
                 photographs = dict(zip(names_of(found), found, strict=True))
-            tracks = build_tracks(found, progress=told, **options)
+            tracks = build_tracks(found, progress=told, workers=workers, **options)
             told("cameras", 0, 1)
             focal = _exif_focal(tracks, photographs) if exif_focal else None
-            result = _upgraded(tracks, cameras, camera, focal)
+            result = _upgraded(tracks, cameras, camera, focal, workers)
     except NoTracks as error:
         out.print(f"[bold red]no scene:[/] the photographs {escape(error.was)}", soft_wrap=True)
         out.print(f"needed: {escape(error.needed)}", soft_wrap=True)
@@ -185,7 +186,7 @@ def _priors(focal: Array | None, groups: Indices, camera: str) -> list[eg.Intrin
 
 
 def _upgraded(
-    tracks: eg.Tracks, cameras: str, camera: str, focal: Array | None
+    tracks: eg.Tracks, cameras: str, camera: str, focal: Array | None, workers: int
 ) -> eg.MetricUpgrade:
     """Return the metric scene; with "auto", of own cameras where one does not fit."""
     sizes = np.asarray(tracks.sizes)
@@ -196,7 +197,7 @@ def _upgraded(
         one &= bool(np.nanmax(focal) < (1.0 + _ZOOMED) * np.nanmin(focal))
     same, own = np.zeros(n, dtype=np.intp), np.arange(n)
     groups = {"one": same, "own": own, "size": kinds, "auto": same if one else own}[cameras]
-    options: Any = {"image_size": sizes, "camera": camera}
+    options: Any = {"image_size": sizes, "camera": camera, "workers": workers}
     known = _priors(focal, groups, camera)
     result = eg.metric_upgrade(tracks, shared=groups, priors=known, **options)
     if cameras == "auto" and one and "unlike cameras" in result.flags:

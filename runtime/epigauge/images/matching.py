@@ -139,7 +139,7 @@ def match_images(
         image = as_image(name, source)
         shown = os.fspath(source) if isinstance(source, str | os.PathLike) else name
         sizes.append((image.shape[1], image.shape[0]))
-        found.append(features(cv2, found_by, shown, image, max_size, max_features))
+        found.append(features(cv2, found_by, shown, image, max_size, max_features)[:2])
     (x1, descriptors1), (x2, descriptors2) = found
     rows1, rows2 = _mutual(cv2, descriptors1, descriptors2, ratio)
     pairs = np.column_stack([x1[rows1], x2[rows2]])
@@ -178,8 +178,8 @@ def seeker(cv2: Any, detector: str, max_features: int) -> Any:
 
 def features(
     cv2: Any, seeker: Any, name: str, image: Image, max_size: int, max_features: int
-) -> tuple[Array, NDArray[Any]]:
-    """Return positions (n, 2) in pixels of the full image, and descriptors (n, k)."""
+) -> tuple[Array, NDArray[Any], Array]:
+    """Return positions (n, 2) in pixels of the full image, descriptors (n, k), and strengths."""
     height, width = image.shape[:2]
     reduction = min(1.0, max_size / max(height, width))
     size = max(1, round(width * reduction)), max(1, round(height * reduction))
@@ -194,14 +194,15 @@ def features(
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     keypoints, descriptors = seeker.detectAndCompute(grey, None)
     if descriptors is None:
-        return np.empty((0, 2)), np.empty((0, 1), dtype=np.float32)
+        return np.empty((0, 2)), np.empty((0, 1), dtype=np.float32), np.empty(0)
+    strength = np.array([keypoint.response for keypoint in keypoints], dtype=np.float64)
     if len(keypoints) > max_features:
-        strength = np.array([keypoint.response for keypoint in keypoints])
         strongest = np.sort(np.argsort(-strength, kind="stable")[:max_features])
         keypoints, descriptors = [keypoints[k] for k in strongest], descriptors[strongest]
+        strength = strength[strongest]
     x = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64)
     # Pixel edges, half a pixel beside the centres, keep their place when an image is resized.
-    return (x + 0.5) * (np.array([width, height]) / size) - 0.5, descriptors
+    return (x + 0.5) * (np.array([width, height]) / size) - 0.5, descriptors, strength
 
 
 def _mutual(

@@ -30,6 +30,10 @@ _BLOCK = 512
 #: Half the side of the square of pixels whose mean is the colour of a feature.
 _COLOUR = 1
 
+#: Strongest features of each photograph by which pairs are ranked, and how many of the others each
+#: is matched with at least.
+_STRONGEST, _PARTNERS = 500, 12
+
 Told = Callable[[str, int, int], object]
 
 
@@ -161,8 +165,9 @@ def match_photographs(
     ----------
     images : sequence of paths
         Photographs.
-    pairs : "all", "sequential" or iterable of (int, int)
-        Which to match: all, each with the next five, or those listed.
+    pairs : "all", "sequential", "ranked" or iterable of (int, int)
+        Which to match: all; each with the next five; each with the twelve others that most of its
+        500 strongest features match, for large folders in any order; or those listed.
     detector : {"sift", "orb", "akaze", "brisk", "kaze"}
         As of `match_images`. SIFT's descriptors are compared by their square roots (RootSIFT [1]_).
     ratio : float
@@ -199,18 +204,21 @@ def match_photographs(
         raise ArgumentError("images", f"holds {len(paths)}", "two photographs or more")
     ratio = as_positive("ratio", ratio)
     max_features = as_count("max_features", max_features, at_least=8)
-    listed = _listed(pairs, len(paths))
-    cv2, found = opencv(), []
+    listed = None if pairs == "ranked" else _listed(pairs, len(paths))
+    cv2, found, strongest = opencv(), [], []
     for k, path in enumerate(paths):
         if progress is not None:
             progress("features", k, len(paths))
         image = load_image(path)
-        x, descriptors = features(
+        x, descriptors, strength = features(
             cv2, seeker(cv2, detector, max_features), str(path), image, max_size, max_features
         )
-        x, descriptors = _distinct(x, descriptors)
+        x, descriptors, strength = _distinct(x, descriptors, strength)
         size = image.shape[1], image.shape[0]
         found.append((size, x, _normalized(descriptors, detector), _colours(image, x)))
+        strongest.append(found[-1][2][np.argsort(-strength, kind="stable")[:_STRONGEST]])
+    if listed is None:
+        listed = _ranked(strongest, ratio, progress)
     matched = {}
     for k, (i, j) in enumerate(listed):
         if progress is not None:
@@ -236,7 +244,8 @@ def names_of(paths: list[Path]) -> tuple[str, ...]:
 def _listed(pairs: str | Iterable[tuple[int, int]], n: int) -> list[tuple[int, int]]:
     if isinstance(pairs, str):
         if pairs not in ("all", "sequential"):
-            raise ArgumentError("pairs", f"is {pairs!r:.60}", "'all', 'sequential', or pairs")
+            needed = "'all', 'sequential', 'ranked', or pairs"
+            raise ArgumentError("pairs", f"is {pairs!r:.60}", needed)
         most = n if pairs == "all" else 5
         return [(i, j) for i, j in itertools.combinations(range(n), 2) if j - i <= most]
     listed = sorted({(min(i, j), max(i, j)) for i, j in pairs})
@@ -246,10 +255,34 @@ def _listed(pairs: str | Iterable[tuple[int, int]], n: int) -> list[tuple[int, i
     return listed
 
 
-def _distinct(x: Array, descriptors: NDArray[Any]) -> tuple[Array, NDArray[Any]]:
+def _ranked(
+    strongest: list[NDArray[Any]], ratio: float, progress: Told | None = None
+) -> list[tuple[int, int]]:
+    """Return the pairs that are among the best of either image, by matches of strong features."""
+    n = len(strongest)
+    every = list(itertools.combinations(range(n), 2))
+    if n - 1 <= _PARTNERS:
+        return every
+    counts = np.zeros((n, n), dtype=np.intp)
+    for k, (i, j) in enumerate(every):
+        if progress is not None:
+            progress("ranking", k, len(every))
+        counts[i, j] = counts[j, i] = len(_matched(strongest[i], strongest[j], ratio))
+    best = np.argsort(-counts, axis=1, kind="stable")[:, :_PARTNERS]
+    chosen = np.zeros((n, n), dtype=np.bool_)
+    chosen[np.arange(n)[:, None], best] = True
+    # Images that have nothing in common are among the best of one only by their number.
+    chosen &= counts > 0
+    return [(i, j) for i, j in every if chosen[i, j] or chosen[j, i]]
+
+
+def _distinct(
+    x: Array, descriptors: NDArray[Any], strength: Array
+) -> tuple[Array, NDArray[Any], Array]:
     """Return features without further orientations of one place: two tracks would be one."""
     first = np.sort(np.unique(np.round(x, 3), axis=0, return_index=True)[1])
-    return x[first], descriptors[first] if len(descriptors) == len(x) else descriptors
+    own = descriptors[first] if len(descriptors) == len(x) else descriptors
+    return x[first], own, strength[first]
 
 
 def _normalized(descriptors: NDArray[Any], detector: str) -> NDArray[Any]:

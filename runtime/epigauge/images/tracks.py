@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ __all__ = ["CheckedPair", "NoTracks", "TrackSource", "build_tracks"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+_Verdict = tuple[NDArray[np.bool_], Array, tuple[str, ...]]
 
 #: Flags of a pair whose matches are not used at all.
 _WRONG = {"no common geometry"}
@@ -83,6 +85,7 @@ def build_tracks(
     cache: PathLike | None = None,
     min_inliers: int = _LEAST,
     seed: int = 0,
+    workers: int = 1,
     progress: Callable[[str, int, int], object] | None = None,
     **options: Any,
 ) -> Tracks:
@@ -97,7 +100,7 @@ def build_tracks(
     images : sequence of paths, PairwiseMatches, or path
         Photographs; or what `match_photographs` or another program found in them; or a COLMAP
         database, whose verified pairs are taken.
-    pairs : "all", "sequential" or iterable of (int, int)
+    pairs : "all", "sequential", "ranked" or iterable of (int, int)
         Of photographs, as `match_photographs`.
     cache : path, optional
         Of photographs: an NPZ file for features and matches, read if it exists and is of the same
@@ -106,6 +109,8 @@ def build_tracks(
         Fewest right matches of a pair that is used.
     seed : int
         Of `estimate_fundamental`.
+    workers : int
+        Threads that verify pairs; the result does not depend on them.
     progress : callable, optional
         Called with what is being done, how many of it are done, and of how many.
     **options
@@ -131,6 +136,7 @@ def build_tracks(
     >>> found = eg.metric_upgrade(tracks, image_size=tracks.sizes)  # doctest: +SKIP
     """
     min_inliers = as_count("min_inliers", min_inliers, at_least=8)
+    workers = as_count("workers", workers)
     if isinstance(images, PairwiseMatches):
         found = images
     elif isinstance(images, str | os.PathLike):
@@ -142,12 +148,7 @@ def build_tracks(
     checked: list[CheckedPair] = []
     agreed: list[tuple[Array, int, int, Indices]] = []
     parallax = False
-    for k, ((i, j), rows) in enumerate(found.pairs.items()):
-        if progress is not None:
-            progress("verification", k, len(found.pairs))
-        inlier, distances, flags = _verified(
-            found.points[i][rows[:, 0]], found.points[j][rows[:, 1]], seed
-        )
+    for (i, j), rows, (inlier, distances, flags) in _all_verified(found, seed, workers, progress):
         count = int(np.count_nonzero(inlier))
         used = count >= max(min_inliers, _SHARE * len(rows)) and not _WRONG & set(flags)
         names = found.names[i], found.names[j]
@@ -190,7 +191,27 @@ def _photographs(
     return found
 
 
-def _verified(x1: Array, x2: Array, seed: int) -> tuple[NDArray[np.bool_], Array, tuple[str, ...]]:
+def _all_verified(
+    found: PairwiseMatches,
+    seed: int,
+    workers: int,
+    progress: Callable[[str, int, int], object] | None,
+) -> Iterator[tuple[tuple[int, int], Indices, _Verdict]]:
+    """Yield each pair, its matches, and what `_verified` says of them, in their order."""
+
+    def verdict(pair: tuple[tuple[int, int], Indices]) -> _Verdict:
+        (i, j), rows = pair
+        return _verified(found.points[i][rows[:, 0]], found.points[j][rows[:, 1]], seed)
+
+    with ThreadPoolExecutor(workers) as pool:
+        verdicts = pool.map(verdict, found.pairs.items())
+        for k, ((images, rows), own) in enumerate(zip(found.pairs.items(), verdicts, strict=True)):
+            if progress is not None:
+                progress("verification", k, len(found.pairs))
+            yield images, rows, own
+
+
+def _verified(x1: Array, x2: Array, seed: int) -> _Verdict:
     """Return the inliers of a pair, their distances, and its flags."""
     none = np.zeros(len(x1), dtype=np.bool_), np.zeros(len(x1))
     if len(x1) < _LEAST:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.cameras import MetricReconstruction, camera_model
+from epigauge.cameras import Cameras, MetricReconstruction, camera_model
+from epigauge.errors import ArgumentError
+from epigauge.multi_view.adjust import bundle_adjust
+from epigauge.multi_view.tracks import Tracks
+from epigauge.multi_view.uncertainty import covariance
 from epigauge.uncertainty.covariance import MetricCovariance
 from epigauge.uncertainty.scatter import scatter_of
 
-__all__ = ["focal_lengths_of", "known_to", "turn_std"]
+__all__ = ["beside_the_model", "focal_lengths_of", "known_to", "turn_std"]
 
 Array = NDArray[np.float64]
 
@@ -19,6 +25,16 @@ _ONE_FOR_BOTH = 0.0017 / np.sqrt(12.0)
 
 #: Views that scatter so many times as much as noise ever lets them show an error of the model.
 _CLEARLY = 2.0
+
+#: Models that are part of a richer one, and what its parameters are called there.
+_RICHER, _NAMES = "OPENCV", {"f": ("fx", "fy"), "k": ("k1",)}
+_PARTS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+
+#: Relative decrease of the cost that ends the richer adjustment.
+_SHIFTED = 1e-4
+
+#: Views of a camera that determine the richer model, at least.
+_VIEWS = 4
 
 #: Noise below this share of width plus height is rounding, which hangs together as it likes.
 _EXACT = 1e-6
@@ -50,12 +66,9 @@ def known_to(known: MetricCovariance, unit: float) -> tuple[Array, float, bool]:
     erroneous : bool
         Whether they clearly contradict one another.
     """
-    cameras = known.reconstruction.cameras
-    model = camera_model(cameras.model)
-    wanted = np.zeros(len(model.adjusted))
-    wanted[list(model.focal)] = 1.0 / len(model.focal)
-    blocks = [known.intrinsics(c) for c in range(len(cameras))]
-    std = np.sqrt([max(float(wanted @ block @ wanted), 0.0) for block in blocks])
+    model = camera_model(known.reconstruction.cameras.model)
+    wanted, variances = _focal(known)
+    std = np.sqrt(variances)
     factor, erroneous = 1.0, False
     if known.noise_px > _EXACT * unit:
         scatter = scatter_of(known, wanted)
@@ -65,6 +78,74 @@ def known_to(known: MetricCovariance, unit: float) -> tuple[Array, float, bool]:
     if len(model.focal) == 1:
         std = np.hypot(std, _ONE_FOR_BOTH * focal_lengths_of(known.reconstruction))
     return std, factor, erroneous
+
+
+def beside_the_model(
+    tracks: Tracks, known: MetricCovariance, backend: str | None, workers: int = 1
+) -> Array:
+    """Return how far a richer camera model moves each focal length, beyond what noise would.
+
+    Two estimates of one quantity, one of them with more unknowns, differ by the noise of what the
+    richer one knows less [1]_. What they differ by more the poorer model has put into the focal
+    length: tangential distortion, a second radial term, axes of different length.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        What was adjusted, with its weights.
+    known : MetricCovariance
+        Of the adjustment, with all parameters of the model refined.
+    backend : str or None
+        Where the formulas are computed.
+    workers : int
+        Threads.
+
+    Returns
+    -------
+    ndarray, shape (c,)
+        In pixels; zero where the views do not determine a richer model, or there is none.
+
+    References
+    ----------
+    .. [1] J. A. Hausman, "Specification tests in econometrics", Econometrica 46(6), 1978.
+    """
+    poor = known.reconstruction
+    none = np.zeros(len(poor.cameras))
+    views = np.bincount(poor.cameras.camera_of_view)
+    if poor.cameras.model not in _PARTS or views.min() < _VIEWS:
+        return none
+    options: Any = {"workers": workers, "backend": backend}
+    try:
+        found = bundle_adjust(tracks, _richer(poor), ftol=_SHIFTED, max_iter=20, **options)
+        rich = found.reconstruction
+        assert isinstance(rich, MetricReconstruction)
+        sure = covariance(tracks, rich, noise_px=known.noise_px, backend=backend)
+    except ArgumentError:
+        return none
+    shift = focal_lengths_of(rich) - focal_lengths_of(poor)
+    by_noise = np.maximum(_focal(sure)[1] - _focal(known)[1], 0.0)
+    return np.asarray(np.sqrt(np.maximum(shift**2 - by_noise, 0.0)))
+
+
+def _richer(found: MetricReconstruction) -> MetricReconstruction:
+    """Return the same cameras as those of the richer model."""
+    old, new = camera_model(found.cameras.model), camera_model(_RICHER)
+    params = np.zeros((len(found.cameras), len(new.params)))
+    for k, name in enumerate(old.params):
+        for other in _NAMES.get(name, (name,)):
+            params[:, new.params.index(other)] = found.cameras.params[:, k]
+    cameras = Cameras(_RICHER, params, found.cameras.camera_of_view)
+    return MetricReconstruction(found.R, found.t, found.X, cameras)
+
+
+def _focal(known: MetricCovariance) -> tuple[Array, Array]:
+    """Return the weights of parameters in the mean focal length, and its variances, (c,)."""
+    cameras = known.reconstruction.cameras
+    model = camera_model(cameras.model)
+    wanted = np.zeros(len(model.adjusted))
+    wanted[list(model.focal)] = 1.0 / len(model.focal)
+    blocks = [known.intrinsics(c) for c in range(len(cameras))]
+    return wanted, np.array([max(float(wanted @ block @ wanted), 0.0) for block in blocks])
 
 
 def turn_std(known: MetricCovariance) -> float:

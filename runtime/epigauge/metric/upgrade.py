@@ -15,7 +15,7 @@ from epigauge._results import Result
 from epigauge.bundle.prior_kinds import IntrinsicPrior
 from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
-from epigauge.metric.deviation import focal_lengths_of, known_to, turn_std
+from epigauge.metric.deviation import beside_the_model, focal_lengths_of, known_to, turn_std
 from epigauge.metric.motion import motion_flags
 from epigauge.metric.pair import OPEN, WEAK
 from epigauge.metric.samples import sampled
@@ -58,9 +58,10 @@ class MetricUpgrade(Result):
     focal_px, focal_std_px : float or ndarray, shape (c,)
         Focal length in pixels and its standard deviation, of one camera, or of each of several (the
         mean of fx and fy of models that have both). The deviation is that of `covariance`, wider
-        where views contradict one another beyond the noise ("model error"), and with 0.05 % of
-        models that have one focal length for both axes, which real cameras do not have exactly. It
-        is infinite where nothing determines the focal length.
+        where views contradict one another beyond the noise ("model error"), with what a richer
+        model (OPENCV) moves the focal length by beyond the noise, and with 0.05 % of models that
+        have one focal length for both axes, which real cameras do not have exactly. It is infinite
+        where nothing determines the focal length.
     flags : tuple of str
         From `epigauge.verdicts.FLAGS`.
     success : bool
@@ -298,21 +299,24 @@ def _judged(
     focal, known = focal_lengths_of(found), None
     weights = np.where(bundle.rejected, 0.0, tracks.weights)
     flags, turned, factor = set(bundle.flags), 0.0, 1.0
-    std = np.full(len(focal), np.inf)
+    std, beside = np.full(len(focal), np.inf), np.zeros(len(focal))
     try:
         options: Any = {"refine": fit.refined, "backend": backend}
         priors = tuple(prior for prior in search.priors if prior.name in fit.refined)
         if priors:
             options |= {"priors": priors, "noise_px": _noise_px(bundle, tracks, weights == 0.0)}
-        known = covariance(tracks.weighted(weights), found, **options)
+        kept = tracks.weighted(weights)
+        known = covariance(kept, found, **options)
         std, factor, erroneous = known_to(known, float(np.median(images.unit)))
+        if fit.refined == camera_model(search.camera).adjusted and not search.priors:
+            beside = beside_the_model(kept, known, backend, search.options["workers"])
         if erroneous:
             flags.add("model error")
     except ArgumentError:
         flags.add("undetermined")
     with np.errstate(invalid="ignore"):
         share = np.nan_to_num(std / focal, nan=np.inf)
-    if (share > WEAK).any():
+    if (np.hypot(share, beside / focal) > WEAK).any():
         flags.add("weak focal length")
     # By the noise alone: what a lens does beside tells nothing of the motion.
     if known is not None and (share > WEAK * factor).any():
@@ -326,6 +330,7 @@ def _judged(
     of_sample = np.isin(tracks.point, search.sample.points)
     if search.misfit(fit, median(np.linalg.norm(bundle.fun[of_sample], axis=1))):
         flags.add("unlike cameras")
+    std = np.hypot(std, beside)
     listed = ordered(flags)
     spoiling = [f"{name}: {FLAGS[name].sentence}" for name in listed if not usable([name], "views")]
     one = len(focal) == 1
