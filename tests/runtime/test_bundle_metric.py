@@ -13,6 +13,7 @@ from bundle_scenes import CASES, PRIORS, problem_of, scene
 from epigauge.bundle import compiled
 from epigauge.bundle import problem as problem_module
 from epigauge.bundle.dampings import Covariant
+from epigauge.bundle.jobs import metric_job
 from epigauge.bundle.problem import BundleProblem, BundleState
 from epigauge.bundle.solve import Step
 from epigauge.bundle.strategies import STRATEGIES
@@ -210,6 +211,8 @@ def test_every_method_reaches_the_same_cost(method: str) -> None:
         ({"refine": ("f", "f")}, "twice"),
         ({"refine": "pose", "fixed_views": range(4), "fixed_points": range(25)}, "nothing"),
         ({"fixed_views": [4]}, "fixed_views.*4"),
+        ({"fixed_views": 3}, "fixed_views is 3"),
+        ({"fixed_points": 3}, "fixed_points is 3"),
         ({"fixed_points": [-1]}, "fixed_points.*-1"),
         ({"priors": [eg.PositionPrior(9, (0, 0, 0), sigma=1.0)]}, r"priors\[0\].view"),
         ({"priors": [eg.PointPrior(1, (0, np.nan, 0), sigma=1.0)]}, "position"),
@@ -237,6 +240,16 @@ def test_every_method_reaches_the_same_cost(method: str) -> None:
 def test_bad_options_are_refused(options: dict[str, Any], named: str) -> None:
     with pytest.raises(eg.ArgumentError, match=named):
         eg.bundle_adjust(*scene(), **options)
+
+
+def test_a_start_that_leads_to_no_camera_is_named() -> None:
+    tracks, start = scene()
+    options = {"refine": "all", "fixed_views": (), "fixed_points": (), "priors": None}
+    job = metric_job(tracks, start, **options)
+    away = job.cameras.copy()
+    away[:, -1] = 1e20
+    with pytest.raises(eg.ArgumentError, match="start leads to cameras or points that are none"):
+        job.result(away, job.points)
 
 
 def test_what_only_metric_starts_have_is_refused_for_others() -> None:

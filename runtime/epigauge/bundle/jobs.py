@@ -202,7 +202,13 @@ def metric_job(
         # What was fixed comes back as it was, to the last bit.
         cameras, X = cameras.copy(), X.copy()
         cameras[views, :_POSE], X[points] = start.vectors[views, :_POSE], start.X[points]
-        return _reconstruction(start.cameras, cameras, X)
+        try:
+            return _reconstruction(start.cameras, cameras, X)
+        except ArgumentError as error:  # no step has bounds beside those of focal lengths
+            was = f"leads to cameras or points that are none: {error.argument} {error.was}"
+            raise ArgumentError(
+                "start", was, "another one, or fewer parameters to refine"
+            ) from None
 
     return Job(
         camera_model(start.cameras.model),

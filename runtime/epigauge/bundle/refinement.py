@@ -71,6 +71,20 @@ def refinable(refine: Any, cameras: Cameras) -> dict[str, Array]:
     return {name: known[name] for name in chosen}
 
 
+def listed(name: str, value: Iterable[int]) -> tuple[int, ...]:
+    """Return what may be an iterator as a tuple.
+
+    Raises
+    ------
+    ArgumentError
+        If it lists nothing, as a number does.
+    """
+    try:
+        return tuple(value)
+    except TypeError:
+        raise ArgumentError(name, f"is {value!r:.60}", "a list of integers") from None
+
+
 def fixed_indices(name: str, value: Iterable[int], count: int) -> Indices:
     """Return numbers of views or points to be fixed, each once."""
     array = np.asarray(value if isinstance(value, np.ndarray) else list(value))

@@ -17,7 +17,7 @@ from epigauge._options import Loss as LossName
 from epigauge._results import Result
 from epigauge.bundle.jobs import metric_job
 from epigauge.bundle.observations import ObservationGraph
-from epigauge.bundle.refinement import fixed_indices
+from epigauge.bundle.refinement import fixed_indices, listed
 from epigauge.bundle.run import minimized
 from epigauge.bundle.ties import Ties
 from epigauge.cameras import CameraModel, MetricReconstruction, camera_model
@@ -170,7 +170,8 @@ def adjust_parts(
         writer = PartsWriter.new(output, parts.n_views, unit, whitened, parts.names)
     begun, numbers = parts.start()
     begun = begun if start is None else start
-    fixed_views, fixed_points = tuple(fixed_views), tuple(fixed_points)
+    fixed_views = listed("fixed_views", fixed_views)
+    fixed_points = listed("fixed_points", fixed_points)
     if not isinstance(begun, MetricReconstruction):
         was = f"is a {type(begun).__name__}"
         raise ArgumentError("start", was, "an eg.MetricReconstruction, or none: the folder's")

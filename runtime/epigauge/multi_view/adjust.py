@@ -17,7 +17,7 @@ from epigauge.bundle.dampings import DAMPINGS
 from epigauge.bundle.jobs import job_of
 from epigauge.bundle.observations import ObservationGraph, whitened
 from epigauge.bundle.prior_kinds import Prior, listed_priors
-from epigauge.bundle.refinement import fixed_indices
+from epigauge.bundle.refinement import fixed_indices, listed
 from epigauge.bundle.run import checked_gauge, minimized
 from epigauge.bundle.strategies import STRATEGIES
 from epigauge.cameras import AffineReconstruction, AnyReconstruction, MetricReconstruction
@@ -190,7 +190,8 @@ def bundle_adjust(
     """
     if not isinstance(tracks, Tracks):
         raise ArgumentError("tracks", f"is a {type(tracks).__name__}", "eg.Tracks(...)")
-    fixed_views, fixed_points = tuple(fixed_views), tuple(fixed_points)
+    fixed_views = listed("fixed_views", fixed_views)
+    fixed_points = listed("fixed_points", fixed_points)
     priors = None if priors is None else listed_priors(priors)
     if noise_px != "tracks" and not priors:
         raise ArgumentError("noise_px", "is given without priors", "priors, or the default")

@@ -18,6 +18,7 @@ from epigauge.bundle.moves import best_conditioned
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.problem import Estimate
+from epigauge.bundle.refinement import listed
 from epigauge.bundle.run import bundle_problem
 from epigauge.cameras import AffineReconstruction
 from epigauge.errors import ArgumentError
@@ -204,8 +205,8 @@ def affine_covariance(
         tracks,
         reconstruction,
         refine="all",
-        fixed_views=tuple(fixed_views),
-        fixed_points=tuple(fixed_points),
+        fixed_views=listed("fixed_views", fixed_views),
+        fixed_points=listed("fixed_points", fixed_points),
         priors=None,
     )
     table = kernels.table(backend)

@@ -18,6 +18,7 @@ from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.prior_kinds import Prior
 from epigauge.bundle.priors import Priors
 from epigauge.bundle.problem import Estimate
+from epigauge.bundle.refinement import listed
 from epigauge.bundle.run import bundle_problem
 from epigauge.bundle.similarity import Similarity
 from epigauge.bundle.solve import BundleSystem
@@ -63,8 +64,8 @@ def metric_covariance(
         noise_px = as_positive("noise_px", noise_px)
     free: dict[str, Any] = {
         "refine": refine,
-        "fixed_views": tuple(fixed_views),
-        "fixed_points": tuple(fixed_points),
+        "fixed_views": listed("fixed_views", fixed_views),
+        "fixed_points": listed("fixed_points", fixed_points),
     }
     table = kernels.table(backend)
     if lines is None:
