@@ -81,6 +81,22 @@ class TestTwoViews:
         most = 1.7 if share * off > 10.0 else 1.35
         assert 0.75 <= mean_squared_error(loss, share, off, 60, noise_px=None) <= most
 
+    def test_estimates_that_were_drawn_away_are_flagged(self) -> None:
+        flagged = 0
+        for seed in range(6):
+            view = eg.two_view_scene(4.0, n_points=120, noise_px=1.0, seed=seed)
+            rng = np.random.default_rng(seed)
+            x2 = view.x2.copy()
+            wrong = rng.choice(120, 36, replace=False)
+            angle = rng.uniform(0.0, 2.0 * np.pi, 36)
+            x2[wrong] += 60.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+            result = eg.refine_fundamental(view.x1, x2, loss="cauchy")
+            assert result.success == ("gross errors" not in result.flags)
+            assert result.noise_px <= 2.0 or not result.success
+            flagged += not result.success
+        assert 1 <= flagged <= 4
+        assert "gross errors" not in eg.refine_fundamental(view.x1, view.x2, loss="cauchy").flags
+
     @pytest.mark.parametrize(("share", "off"), WRONG[::2])
     def test_truncated_loss(self, share, off) -> None:
         assert 0.75 <= mean_squared_error("truncated", share, off, 60, noise_px=None) <= 1.6

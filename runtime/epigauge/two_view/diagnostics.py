@@ -91,6 +91,7 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
       front of one camera only do not agree;
     - gross errors: the geometry of highest likelihood under a mixture of right and wrong matches is
       no chance, leaves some far off, and the variance of those near it is less than half of s^2;
+      with a robust loss, where s is more than a quarter per cent of the range of the coordinates;
     - planar scene: ``S_H / (2 n - 8) <= max(1.5, F99) s^2``, with F99 the 99 % quantile of the
       ratio of two such variances. The bound 1.5 is that of the geometric AIC [1]_ for many matches,
       ``S_H + 2 (2 n + 8) s^2 <= S + 2 (3 n + p) s^2``; with few matches an F fits a plane better
@@ -131,7 +132,9 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
         "not pixels": not found.retina and _extent(found) < PIXELS,
     }
     judged = found
-    if not found.searched and is_suspicious(found):
+    # A robust loss that ends with a wide noise may have been drawn away: many were wrong.
+    doubtful = found.by_loss and found.noise > WIDE * RANGE
+    if doubtful or (not found.searched and is_suspicious(found)):
         best = agreeing(found)
         if best.searched and is_common(best):
             judged = best

@@ -46,6 +46,8 @@ class Evidence:
         Largest distance at which a match counts.
     searched : bool
         Whether the inliers were chosen by F itself. Else the caller says that all are right.
+    by_loss : bool
+        Whether a robust loss chose them: from one start, without a search among all matches.
     to_units1, to_units2 : ndarray, shape (3, 3)
         Maps of the images from pixels to these coordinates.
     noise : float
@@ -68,6 +70,7 @@ class Evidence:
     inlier: Mask
     limit: float
     searched: bool
+    by_loss: bool = False
     to_units1: Array
     to_units2: Array
     noise: float
@@ -132,6 +135,7 @@ class Evidence:
             inlier=inlier,
             limit=float(limit),
             searched=True,
+            by_loss=False,
         )
         squares = float(np.sum(found.weights * found.squared))
         return replace(
@@ -176,6 +180,7 @@ def evidence(
         inlier=inlier,
         limit=WITHIN * noise,
         searched=loss.name != "linear",
+        by_loss=loss.name != "linear",
         to_units1=to_units1,
         to_units2=to_units2,
         noise=noise,

@@ -81,6 +81,7 @@ def agreeing(found: Evidence) -> Evidence:
         inlier=inlier,
         limit=limit,
         searched=True,
+        by_loss=False,
         noise=float(np.sqrt(squares / max(count - found.parameters, 1))),
     )
 
