@@ -65,10 +65,13 @@ class Segments:
         pose = cameras[:, :12].reshape(-1, 3, 4)
         centres = -np.einsum("nji,nj->ni", pose[:, :, :3], pose[:, :, 3])[self.view]
         n, v = lines[self.line, :3], lines[self.line, 3:]
-        away = np.linalg.norm(n - np.cross(centres, v), axis=1)
-        order = np.lexsort((-away, self.line))
-        first = np.searchsorted(self.line, np.arange(len(lines)))
-        return np.asarray(centres[order[first]])
+        away = np.sum((n - np.cross(centres, v)) ** 2, axis=1)
+        away = np.where(np.isfinite(away), away, -1.0)
+        every = np.arange(len(lines))
+        farthest = np.maximum.reduceat(away, np.searchsorted(self.line, every))
+        those = np.flatnonzero(away == farthest[self.line])
+        # Of equal ones the first.
+        return np.asarray(centres[those[np.searchsorted(self.line[those], every)]])
 
 
 @dataclass(frozen=True)
