@@ -86,7 +86,7 @@ html_theme_options = {
 html_sidebars = {
     page: []
     for page in (
-        *("index", "quickstart", "results", "interoperability", "casadi", "data"),
+        *("index", "quickstart", "gallery", "results", "interoperability", "casadi", "data"),
         *("contributing", "changelog"),
     )
 }

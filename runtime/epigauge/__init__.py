@@ -221,6 +221,7 @@ _WHERE = {
 }
 _MODULES = {
     **{name: name for name in ("arrays", "casadi", "colmap", "datasets", "interop", "kernels")},
+    "cameras": "cameras",
     **{
         name: name
         for name in ("errors", "images", "io", "lm", "plots", "reports", "samples", "scenes")

@@ -57,10 +57,24 @@ def walk(quick: bool, programs: bool = True) -> Iterator[tuple[str, list[str]]]:
             yield f"{name}: choices", list(cli.choices(command, run)) if not slow else []
         yield f"{name}: bad input", list(cli.bad_inputs(command, run, quick))
     yield "flags in the documentation", list(flags_in_pages())
+    yield "names in the documentation", list(names_in_pages())
     if not quick:
         yield from examples(programs)
         yield "docstrings", list(docstrings())
         yield "pages in a browser", list(in_browser(Path()))
+
+
+def names_in_pages() -> Iterator[str]:
+    """Yield names of the package that a page uses and that nobody reaches after importing it."""
+    import epigauge as eg
+
+    pages = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").rglob("*.md"))]
+    for page in pages:
+        for name in set(re.findall(r"\beg\.([a-zA-Z]\w*)", page.read_text(encoding="utf-8"))):
+            try:
+                eg.__getattr__(name)  # not what other imports have left there
+            except AttributeError:
+                yield f"{page.relative_to(CHECKOUT)}: there is no eg.{name}"
 
 
 def flags_in_pages() -> Iterator[str]:

@@ -119,7 +119,7 @@ def draw_history(axes: Axes, history: Sequence[Row]) -> None:
     finish(axes, "Convergence")
 
 
-def finish(axes: Axes, title: str, legend: bool = True) -> None:
+def finish(axes: Axes, title: str, legend: bool = True, place: Any = "best") -> None:
     """Give a panel of curves the common look."""
     axes.set_title(title, loc="left", fontsize=11)
     axes.grid(color="0.9", lw=0.7)
@@ -128,4 +128,4 @@ def finish(axes: Axes, title: str, legend: bool = True) -> None:
     axes.spines[["left", "bottom"]].set_color("0.6")
     axes.tick_params(labelsize=8, color=GREY)
     if legend:
-        axes.legend(fontsize=9, frameon=False)
+        axes.legend(fontsize=9, frameon=False, loc=place)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from epigauge.cameras import MetricReconstruction
 from epigauge.multi_view.adjust import BundleResult
 from epigauge.multi_view.display import Display, camera_spacing, display, is_sequence
 from epigauge.multi_view.tracks import Tracks
@@ -84,7 +85,8 @@ def plot_bundle(
     if shown.distorted:
         caption = "Points and cameras (distorted: in no basis do all cameras look usual)"
     else:
-        caption = "Points and cameras (to look at; no calibration)"
+        metric = isinstance(result.reconstruction, MetricReconstruction)
+        caption = f"Points and cameras ({'calibrated' if metric else 'to look at; no calibration'})"
     oblique.set_title(caption, loc="left", fontsize=11)
     _draw_legend(oblique, bool(len(ends)))
     for row, side, name in ((0, _ABOVE, "From above"), (1, _SIDE, "From the side")):

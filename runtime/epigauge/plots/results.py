@@ -40,8 +40,8 @@ Array = NDArray[np.float64]
 
 _WIDTH = 11.0  # inches
 _ORANGE = "#c25e00"
-#: Most segments or arrows drawn.
-_MOST = 2000
+#: Most segments of a view, and most arrows of a kind, that are drawn.
+_MOST, _ARROWS = 2000, 300
 
 
 @singledispatch
@@ -227,22 +227,24 @@ def _moves(
     error: Array | None = None,
     flags: tuple[str, ...] = (),
 ) -> Figure:
-    """Draw arrows from where points were to where they are, and the lengths that remain."""
+    """Draw arrows from where points were to where they are, some of many; and their lengths."""
     figure = _headed(title, 5.0, flags)
     arrows, lengths = figure.subplots(1, 2, width_ratios=(1.2, 1.0))
     good = np.ones(len(x1), dtype=np.bool_) if inlier is None else inlier
     for rows, colour, name in ((good, BLUE, "agree"), (~good, RED, "do not agree")):
-        step = max(1, -(-int(rows.sum()) // _MOST))
+        step = max(1, -(-int(rows.sum()) // _ARROWS))
         a, b = x1[rows][::step], x2[rows][::step]
         if len(a):
-            label = name if inlier is not None else "matches"
+            label = f"{int(rows.sum())} {name}" if inlier is not None else "matches"
             look: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
             arrows.quiver(*a.T, *(b - a).T, color=colour, width=0.003, label=label, **look)
     both = np.vstack([x1, x2])
     low, high = both.min(axis=0), both.max(axis=0)
     arrows.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), xlabel="x (px)", ylabel="y (px)")
-    arrows.set_aspect("equal", adjustable="datalim")
-    finish(arrows, "From image 1 to image 2")
+    arrows.set_aspect("equal", adjustable="box")
+    arrows.set_anchor("N")
+    finish(arrows, "From image 1 to image 2", legend=False)
+    arrows.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2)
     if error is None:
         values, name = np.linalg.norm(x2 - x1, axis=1)[good], "distance moved (px)"
     else:
@@ -263,7 +265,7 @@ def _sides(points: Array, centres: Array, title: str) -> Figure:
         if len(centres):
             axes.plot(*centres[:, (i, j)].T, "^", color=_ORANGE, ms=6, label="cameras")
         axes.set_aspect("equal", adjustable="datalim")
-        finish(axes, name)
+        finish(axes, name, place="upper right")
     return figure
 
 
