@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge.kernels import Table
 from epigauge.linear import Levenberg
-from epigauge.two_view import mixture_native
+from epigauge.two_view import mixture_native, native
 from epigauge.two_view.chance import CEILING, chance_agreement, log10_false_alarms
 from epigauge.two_view.conditioning import RMS
 from epigauge.two_view.criteria import Reprojection
@@ -192,7 +192,7 @@ class Consensus:
 
         F by least squares, each match weighing as it is probably right: expectation maximisation.
         """
-        if self.criterion.kernels.compiled:
+        if self.criterion.kernels.compiled and isinstance(self.chart, Block):
             known = mixture_native.Judged(*(getattr(start, name) for name in _JUDGED))
             found = mixture_native.climb(*self._q, known, self._options(RANGE))
             return start if found.score == start.score else Agreement(*found)
@@ -208,8 +208,13 @@ class Consensus:
 
     def _fitted(self, F: Array, weights: Array) -> Array:
         """Return the geometry of least squares near one."""
-        problem = EliminatedProblem(self.criterion, self.chart, weights, Loss("linear"), exact=True)
-        start = self.chart.start(F)
+        start, criterion = self.chart.start(F), self.criterion
+        if criterion.kernels.compiled:
+            choices = ("reprojection", "linear", "levenberg", True)
+            matches = (criterion.q1, criterion.q2, weights)
+            fitted = native.minimize(self.chart, start, matches, choices, 1.0, _STOPPING, 1.0)
+            return np.asarray(fitted.state.F)
+        problem = EliminatedProblem(criterion, self.chart, weights, Loss("linear"), exact=True)
         found = lm.minimize(problem, start, Levenberg(), lm.Classic(), _STOPPING)
         return np.asarray(found.state.F)
 
