@@ -2,9 +2,8 @@
 
     python benchmarks/models.py [--trials 100] [--matches 20 50 200 2000] [--calibrated]
 
-Scenes are those of verdicts.py: a noise of half a pixel, wrong matches uniform over the image. A
-plane and a rotation of uncalibrated cameras are one where the homography is that of a rotation
-within its noise. The last column is the share of trials that call the scene degenerate.
+Scenes are those of verdicts.py: a noise of half a pixel, wrong matches uniform over the image. The
+last columns are the shares of the trials that end in each model.
 """
 
 from __future__ import annotations

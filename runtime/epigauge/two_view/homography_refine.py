@@ -35,6 +35,7 @@ from epigauge.two_view.homography_problem import PARAMETERS, HomographyProblem, 
 from epigauge.two_view.homography_result import HomographyResult
 from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, median
 from epigauge.two_view.planes import rotation_within
+from epigauge.two_view.rotation import is_of_a_turned_camera
 from epigauge.two_view.solve import joined
 from epigauge.two_view.suspicion import TAIL, TAIL_SHARE, WIDE
 from epigauge.verdicts import ordered, usable
@@ -290,6 +291,13 @@ def _assembled(
     deviation = math.sqrt(known**2 / values[0]) if rank == PARAMETERS else math.inf
     gradient = problem.linearize(state).gradient * scale**2
     flags = _flags(problem, state, to1, to2, known, deviation, N)
+    if "pure rotation" in flags and np.isfinite(covariance).all():
+        # Both images in the coordinates of the first, as one camera has them
+        entries = np.kron(to1, np.linalg.inv(to1).T)
+        H = (entries @ unit).reshape(3, 3)
+        own = known**2 * factor / max(variance, np.finfo(float).tiny) * covariance
+        if not is_of_a_turned_camera(H, entries @ own @ entries.T):
+            flags = tuple(flag for flag in flags if flag != "pure rotation")
     finite = np.isfinite(squared)
     return HomographyResult(
         H=pixels / size,

@@ -60,7 +60,7 @@ class TwoViewResult(Result):
     ----------
     model : str
         "nothing" (the matches agree no better than by chance), "still" (the camera did not move),
-        "rotation" (it only turned; without calibration a plane cannot be excluded), "plane", "F",
+        "rotation" (it only turned; without calibration, as an ordinary lens would), "plane", "F",
         or "E" with calibration.
     F, E, H : ndarray, shape (3, 3), or None
         What the model has: H for a still camera, a rotation or a plane, F for "F" and "E", E for
@@ -259,6 +259,8 @@ def _model(
     if not flat and told.isdisjoint(general.flags):
         return name
     flags = {*general.flags, *plane.flags, "planar scene"}
+    if "rotation" not in evidence:  # without calibration H knows best whether it is a camera's
+        flags -= {"pure rotation"} - {*plane.flags}
     # H may be that of a rotation with some calibration, but not with this one
     if "rotation" in evidence and evidence["rotation"]["score"] < evidence["plane"]["score"]:
         flags -= {"pure rotation"} - {*general.flags}
