@@ -176,3 +176,27 @@ def test_threads_verify_the_same() -> None:
     one, two = (eg.build_tracks(matches, workers=workers) for workers in (1, 2))
     assert np.array_equal(one.xy, two.xy)
     assert one.source == two.source
+
+
+def test_damaged_caches_are_named_and_left_as_they_are(tmp_path: Path) -> None:
+    matches, _ = pairwise(n=3)
+    matches.save(tmp_path / "whole.npz")
+    whole = (tmp_path / "whole.npz").read_bytes()
+    assert eg.PairwiseMatches.load(tmp_path / "whole.npz").names == matches.names
+    rng = np.random.default_rng(0)
+    damaged = [b"", b"PK", whole[:1000], whole[:-30], whole[500:], b"\x93NUMPY" + whole[:50]]
+    for _ in range(40):
+        data = bytearray(whole)
+        for at in rng.integers(0, len(whole), 30):
+            data[at] = rng.integers(0, 256)
+        damaged.append(bytes(data))
+    refused = 0
+    for data in damaged:
+        (tmp_path / "d.npz").write_bytes(data)
+        try:
+            eg.PairwiseMatches.load(tmp_path / "d.npz")
+        except (eg.FileFormatError, eg.ArgumentError):
+            refused += 1
+        assert (tmp_path / "d.npz").read_bytes() == data
+    # The archive has check sums: hardly anything passes.
+    assert refused >= 44

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import itertools
 import os
+import struct
+import zipfile
+import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,6 +36,12 @@ _COLOUR = 1
 #: Strongest features of each photograph by which pairs are ranked, and how many of the others each
 #: is matched with at least.
 _STRONGEST, _PARTNERS = 500, 12
+
+#: What NumPy and the ZIP archive in an NPZ file raise where it is none, cut off or changed.
+_DAMAGED = (
+    *(KeyError, ValueError, IndexError, TypeError, AttributeError, EOFError, struct.error),
+    *(zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, MemoryError),
+)
 
 Told = Callable[[str, int, int], object]
 
@@ -132,7 +141,8 @@ class PairwiseMatches:
             If the file is another one, or damaged.
         """
         try:
-            with np.load(path, allow_pickle=False) as data:
+            # NumPy leaves a file that it opened itself open where it is damaged.
+            with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as data:
                 z = {key: data[key] for key in data.files}
             ends = np.cumsum(z["count"])[:-1]
             parts = np.split(z["rows"].astype(np.intp), np.cumsum(z["matches"])[:-1])
@@ -145,7 +155,7 @@ class PairwiseMatches:
                 dict(zip(images, parts, strict=False)),
                 colours,
             )
-        except (KeyError, ValueError, IndexError, TypeError, EOFError) as error:
+        except _DAMAGED as error:
             raise FileFormatError(path, "is no file of PairwiseMatches.save") from error
 
 
