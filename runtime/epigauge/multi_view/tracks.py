@@ -240,8 +240,8 @@ class Tracks(Result):
         >>> import epigauge as eg
         >>> tracks = eg.multi_view_scene(n_points=20, seed=1).tracks
         >>> some, views, points = tracks.subset(tracks.point < 12)
-        >>> some, points.max()
-        (Tracks(5 views, 12 points, 60 observations), np.int64(11))
+        >>> some, int(points.max())
+        (Tracks(5 views, 12 points, 60 observations), 11)
         """
         mask = as_array("keep", keep, "a mask (N,)")
         if mask.dtype != np.bool_ or mask.shape != (len(self),):
