@@ -312,14 +312,14 @@ class TestVerdictWhenAsked:
         xy[::4] += np.random.default_rng(0).uniform(-60.0, 60.0, xy[::4].shape)
         tracks = eg.Tracks(scene.tracks.view, scene.tracks.point, xy)
         made, judged = [], []
-        unjudged, told = eg.BundleResult.unjudged, results._told
+        unjudged, told = eg.BundleResult.unjudged, results.told
 
         def counted(judge: Any, **known: Any) -> eg.BundleResult:
             made.append(known)
             return unjudged(judge, **known)
 
         monkeypatch.setattr(eg.BundleResult, "unjudged", counted)
-        monkeypatch.setattr(results, "_told", lambda *of: judged.append(of) or told(*of))
+        monkeypatch.setattr(results, "told", lambda *of: judged.append(of) or told(*of))
         found = eg.bundle_adjust(tracks, eg.initialize(tracks, robust=True), robust=True)
         assert np.count_nonzero(found.rejected) > 0.8 * len(xy[::4])
         assert "set aside as gross errors" in found.message
