@@ -7,6 +7,7 @@ whole calls from Python, interleaved in one process, all from the same 8-point e
 the row that says so, and the peers that take no start, compute within; few matches on several
 scenes, whose mean is given. The cost is the exact reprojection error, whatever a method minimises,
 and the largest excess is given. Peers that are not installed are left out.
+Then every variant of the C library that this processor runs (`EPIGAUGE_PROCESSOR`).
 """
 
 from __future__ import annotations
@@ -16,11 +17,12 @@ import _one_thread  # noqa: F401  # isort: skip
 import argparse
 import importlib.util
 import json
+import os
 import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ import epigauge as eg
 import numpy as np
 from _measure import described, interleaved, machine, markdown
 from _two_view_peers import METHODS, TRIVIAL, Pair
+from epigauge._library import CHOICE, usable, variant
 
 REFERENCE = "PoseLib, no robust loss"
 DISTANCE_M = 10.0
@@ -118,6 +121,24 @@ def batch(pairs: int, m: int, seconds: float) -> dict[str, dict[str, float]]:
     }
 
 
+def variants(sizes: Iterable[int], seconds: float) -> str:
+    """Return medians of every variant of the C library, each in a process of its own."""
+    rows = []
+    for name in usable():
+        command = [sys.executable, __file__, "--variant", str(seconds), *map(str, sizes)]
+        environment = os.environ | {CHOICE: name}
+        done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+        found = json.loads(done.stdout)
+        cells = [f"{name}{' (chosen here)' if name == variant() else ''}"]
+        for own in found.values():
+            text = seconds_text(own["epigauge"]["median_s"])
+            if REFERENCE in own:
+                text += f", {own[REFERENCE]['median_s'] / own['epigauge']['median_s']:.2g}x"
+            cells.append(text)
+        rows.append(cells)
+    return markdown([f"{CHOICE}=", *(f"m = {m:,}: median, ratio" for m in sizes)], rows)
+
+
 def memory(rows: list[str], m: int) -> dict[str, float]:
     """Return the peak bytes a match beyond the input, each method in a process of its own."""
     pair = pair_of(m)
@@ -202,7 +223,14 @@ def main() -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all numbers there, too")
     parser.add_argument("--quick", action="store_true", help="a few calls, to see that it runs")
     parser.add_argument("--memory-of", nargs=2, metavar=("ROW", "PAIR"), help=argparse.SUPPRESS)
+    parser.add_argument("--variant", nargs="+", metavar="SECONDS M", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
+    if arguments.variant:
+        seconds, *counts = arguments.variant
+        own = [row for row in ("epigauge", REFERENCE) if row in installed()[0]]
+        told = {m: single(own, int(m), SIZES[int(m)], float(seconds)) for m in counts}
+        print(json.dumps(told, default=float))
+        return 0
     if arguments.memory_of:
         print(memory_of(*arguments.memory_of))
         return 0
@@ -218,6 +246,8 @@ def main() -> int:
     print(single_table(found, used), end="\n\n", flush=True)
     if REFERENCE in rows:
         print(f"Ratios are to the median of {REFERENCE}: above 1 is faster.", end="\n\n")
+    counts = dict.fromkeys(sizes) if quick else dict.fromkeys(m for m in SIZES if m <= 10_000)
+    print(variants(counts, 0.01 if quick else 2.0), end="\n\n", flush=True)
     pairs, m = (20, 100) if quick else BATCH
     together = batch(pairs, m, 0.01 if quick else 20.0)
     print(f"{pairs:,} pairs of {m} matches:", batch_table(together, pairs), sep="\n\n")
