@@ -403,7 +403,8 @@ def test_text_with_more_features_than_are_read_is_refused(
 ) -> None:
     tracks, _ = eg.load_scene(good)
     monkeypatch.setattr("epigauge.io._colmap_text.MAX_MATCHES", len(tracks) - 1)
-    assert f"more than {len(tracks) - 1}" in refusal(eg.load_scene, good)
+    told = f"brings the features to {len(tracks)}, more than {len(tracks) - 1}"
+    assert told in refusal(eg.load_scene, good)
     monkeypatch.setattr("epigauge.io._colmap_text.MAX_MATCHES", len(tracks))
     eg.load_scene(good)
 
