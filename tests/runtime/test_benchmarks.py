@@ -79,3 +79,11 @@ def test_confidence() -> None:
     printed = run("confidence.py", "--trials", 12)
     assert "| simulated, all kinds | 12 |" in printed
     assert "Fitted to all:" in printed
+
+
+def test_cluster() -> None:
+    pytest.importorskip("distributed")
+    printed = run("cluster.py", "--observations", 4000, "--steps", 1, "--rounds", 1)
+    assert "| 2 workers |" in printed
+    printed = run("cluster.py", "--parts", "--observations", 4000, "--steps", 1)
+    assert "peak memory" in printed

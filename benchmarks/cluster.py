@@ -1,0 +1,226 @@
+"""Bundle adjustment by processes of a Dask cluster on this machine, beside that in one process.
+
+    python benchmarks/cluster.py [--observations 200000] [--steps 3] [--rounds 3]
+    python benchmarks/cluster.py --parts [--observations 10000000 --views 5000] [--memory-limit MB]
+
+A street: views along a curve, each point seen by eight neighbours, cameras of the model `bal` with
+parameters of their own. First, without `--parts`: the milliseconds of a step in this process (one
+thread), by one worker and by two, best of several rounds in turns; what a step takes of processor
+time, in this process and in the busiest worker; and by how much cost and points differ. With
+`--parts`: observations are generated part by part, written to a folder and adjusted from there by
+two workers; the time of a step, and the most memory that all processes together have held, are told
+beside the time of a step of the same kind in one process, from a tenth of the observations.
+"""
+
+from __future__ import annotations
+
+import _one_thread  # noqa: F401  # isort: skip
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import epigauge as eg
+import numpy as np
+from _measure import described, machine, markdown
+from distributed import Client, LocalCluster
+
+#: Views that see a point, and observations of a part.
+_SEEN, _PART = 8, 250_000
+
+FOCAL = 900.0
+
+
+def cameras(views: int, seed: int = 0) -> eg.MetricReconstruction:
+    """Return cameras along a curve that look to its side, without points."""
+    rng = np.random.default_rng(seed)
+    along = np.arange(views) * 0.5
+    heading = 0.4 * np.sin(along / 40.0)
+    R = np.zeros((views, 3, 3))
+    R[:, 0, 0], R[:, 0, 2], R[:, 1, 1] = np.cos(heading), -np.sin(heading), 1.0
+    R[:, 2, 0], R[:, 2, 2] = np.sin(heading), np.cos(heading)
+    # BAL's cameras look along -z, y up.
+    R = np.diag([1.0, -1.0, -1.0]) @ R
+    centres = np.stack([along, 0.3 * np.sin(along / 3.0), 3.0 * np.sin(along / 25.0)], axis=1)
+    t = -np.einsum("nij,nj->ni", R, centres)
+    params = np.column_stack([np.full(views, FOCAL), rng.normal(0.0, 0.01, (views, 2))])
+    return eg.MetricReconstruction(
+        R, t, np.zeros((1, 3)), eg.Cameras("bal", params, np.arange(views))
+    )
+
+
+def chunks(true: eg.MetricReconstruction, observations: int) -> Iterator[eg.distributed.Chunk]:
+    """Give noisy observations of points beside the views, a part at a time, and a start."""
+    count, views = max(observations // _SEEN, 1), true.n_views
+    parts = max(8, -(-observations // _PART))
+    edges = np.linspace(0, count, parts + 1).astype(int)
+    for k, (begin, end) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        rng = np.random.default_rng([1, k])
+        place = np.sort(rng.uniform(begin, end, end - begin)) / count * (views - _SEEN + 1)
+        first = place.astype(np.intp)
+        middle = true.centres[first + _SEEN // 2]
+        offset = rng.uniform([-2.0, -3.0, 4.0], [2.0, 3.0, 16.0], (end - begin, 3))
+        X = middle + np.einsum("nji,nj->ni", true.R[first + _SEEN // 2], offset * [1.0, 1.0, -1.0])
+        point = np.repeat(np.arange(end - begin), _SEEN)
+        view = (first[:, None] + np.arange(_SEEN)).ravel()
+        scene = eg.MetricReconstruction(true.R, true.t, X, true.cameras)
+        xy = scene.project(_Seen(view, point, views, len(X))) + rng.normal(0.0, 0.5, (len(view), 2))
+        yield eg.distributed.Chunk(X + rng.normal(0.0, 0.02, X.shape), view, point, xy)
+
+
+class _Seen:
+    """As much of tracks as a projection asks for."""
+
+    def __init__(self, view: Any, point: Any, n_views: int, n_points: int) -> None:
+        self.view, self.point, self.n_views, self.n_points = view, point, n_views, n_points
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+
+def off(true: eg.MetricReconstruction) -> eg.MetricReconstruction:
+    """Return cameras that an adjustment can begin at."""
+    rng = np.random.default_rng(2)
+    t = true.t + rng.normal(0.0, 0.005, true.t.shape)
+    params = true.cameras.params + np.array([3.0, 0.0, 0.0]) * rng.normal(size=(true.n_views, 1))
+    own = eg.Cameras("bal", params, true.cameras.camera_of_view)
+    return eg.MetricReconstruction(true.R, t, true.X, own)
+
+
+def whole(observations: int, views: int) -> tuple[eg.Tracks, eg.MetricReconstruction]:
+    """Return tracks and start of all chunks together."""
+    true = cameras(views)
+    parts, begin, starts = [], 0, []
+    for chunk in chunks(true, observations):
+        parts.append((chunk.view, np.asarray(chunk.point) + begin, chunk.xy))
+        starts.append(chunk.X)
+        begin += len(np.asarray(chunk.X))
+    view, point, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
+    start = off(true)
+    X = np.concatenate(starts)
+    return eg.Tracks(view, point, xy), eg.MetricReconstruction(start.R, start.t, X, start.cameras)
+
+
+def a_step(result: Any) -> float:
+    """Return the seconds of a step: what came after the start was linearised."""
+    rows = result.history
+    return float(rows[-1].seconds - rows[0].seconds) / (len(rows) - 1)
+
+
+def processor(client: Client) -> tuple[float, dict[str, float]]:
+    """Return the processor times of this process and of the workers."""
+    return time.process_time(), client.run(time.process_time)
+
+
+def peak_memory(pids: list[int]) -> int:
+    """Return the bytes that processes have held at most, each at its own time."""
+    total = 0
+    for pid in pids:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        total += 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
+    return total
+
+
+def cluster(workers: int) -> LocalCluster:
+    """Return so many processes of one thread."""
+    return LocalCluster(
+        n_workers=workers,
+        threads_per_worker=1,
+        dashboard_address=None,
+        silence_logs=50,
+        memory_limit=0,
+    )
+
+
+def speeds(observations: int, views: int, steps: int, rounds: int) -> None:
+    """Time steps here, by one worker and by two."""
+    tracks, start = whole(observations, views)
+    options: Any = {"max_iter": steps, "ftol": 0.0}
+    found: dict[str, list[tuple[float, float, float]]] = {}
+    results: dict[str, Any] = {}
+    with cluster(1) as one, cluster(2) as two, Client(one) as single, Client(two) as double:
+        for _ in range(rounds):
+            begin = time.process_time()
+            results["in process"] = eg.bundle_adjust(tracks, start, **options)
+            spent = (time.process_time() - begin) / steps
+            found.setdefault("in process", []).append((a_step(results["in process"]), spent, 0.0))
+            for name, client in (("1 worker", single), ("2 workers", double)):
+                before, there = processor(client)
+                results[name] = eg.distributed.bundle_adjust(tracks, client, start, **options)
+                after, now = processor(client)
+                busiest = max(now[address] - there[address] for address in now)
+                row = a_step(results[name]), (after - before) / steps, busiest / steps
+                found.setdefault(name, []).append(row)
+    best = {name: np.min(rows, axis=0) for name, rows in found.items()}
+    expected = results["in process"]
+    table = []
+    for name, (step, here, worker) in best.items():
+        other = results[name]
+        table.append(
+            [
+                name,
+                f"{1e3 * step:.0f}",
+                f"{best['in process'][0] / step:.2f}",
+                f"{1e3 * here:.0f}",
+                f"{1e3 * worker:.0f}",
+                f"{abs(other.cost / expected.cost - 1.0):.1e}",
+                f"{np.abs(other.reconstruction.X - expected.reconstruction.X).max():.1e}",
+            ]
+        )
+    print(f"{len(tracks)} observations, {tracks.n_views} views, {tracks.n_points} points\n")
+    head = ["", "ms a step", "speed", "processor here", "in a worker", "cost off", "points off"]
+    print(markdown(head, table))
+    ratio = best["1 worker"][0] / best["2 workers"][0]
+    overhead = best["1 worker"][0] / best["in process"][0] - 1.0
+    print(f"\ntwo workers against one: {ratio:.2f}; overhead of one worker: {100 * overhead:.0f} %")
+
+
+def parts(observations: int, views: int, steps: int, limit: int | None) -> None:
+    """Adjust a folder of parts by two workers, and measure the memory."""
+    true = cameras(views)
+    options: Any = {"max_iter": steps, "ftol": 0.0}
+    with tempfile.TemporaryDirectory() as folder, cluster(2) as two, Client(two) as client:
+        begin = time.perf_counter()
+        path = Path(folder) / "parts"
+        eg.distributed.write_parts(chunks(true, observations), path, off(true))
+        written = time.perf_counter() - begin
+        begin = time.perf_counter()
+        result = eg.distributed.bundle_adjust(path, client, memory_limit=limit, **options)
+        took = time.perf_counter() - begin
+        held = [peak_memory([pid]) for pid in (os.getpid(), *client.run(os.getpid).values())]
+    step, told = a_step(result), ", ".join(f"{size / 2**30:.2f}" for size in held)
+    print(f"{result.n_observations} observations, {views} views, {len(result.reconstruction.X)}")
+    print(f"points in parts, written in {written:.0f} s; adjusted in {took:.0f} s with the verdict")
+    print(f"{1e3 * step:.0f} ms a step by two workers; cost {result.cost:.8g}, {result.flags}")
+    print(f"peak memory {sum(held) / 2**30:.2f} GiB: client and workers {told}")
+    few, fewer = max(observations // 10, 1000), max(views // 10, 2 * _SEEN)
+    here = a_step(eg.bundle_adjust(*whole(few, fewer), **options))
+    print(f"in one process {1e3 * here:.0f} ms a step for a tenth of the observations")
+
+
+def main() -> int:
+    """Run what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--observations", type=int, default=200_000)
+    parser.add_argument("--views", type=int, help="by default one for 2,000 observations")
+    parser.add_argument("--steps", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--parts", action="store_true", help="a folder, by two workers")
+    parser.add_argument("--memory-limit", type=int, metavar="MB", help="of each worker")
+    options = parser.parse_args()
+    views = options.views or max(options.observations // 2000, 2 * _SEEN)
+    print(f"\n{described(machine(('distributed',)))}\n")
+    if options.parts:
+        limit = None if options.memory_limit is None else 1_000_000 * options.memory_limit
+        parts(options.observations, views, options.steps, limit)
+    else:
+        speeds(options.observations, views, options.steps, options.rounds)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
