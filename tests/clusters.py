@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import epigauge as eg
 import numpy as np
 
 
-def cluster(workers: int) -> Any:
-    """Return a cluster of so many processes of one thread, without a dashboard."""
+@contextmanager
+def cluster(workers: int) -> Iterator[Any]:
+    """Give a cluster of so many processes of one thread, without what Dask warns of."""
     import distributed
 
-    return distributed.LocalCluster(
-        n_workers=workers, threads_per_worker=1, dashboard_address=None, silence_logs=50
-    )
+    options: dict[str, Any] = {"dashboard_address": ":0", "silence_logs": 50}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with distributed.LocalCluster(n_workers=workers, threads_per_worker=1, **options) as found:
+            yield found
 
 
 def metric(model: str = "SIMPLE_RADIAL", shared: bool = True) -> tuple[Any, Any]:

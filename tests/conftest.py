@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -62,10 +61,8 @@ def data_dir() -> Path:
 def client() -> Iterator[Any]:
     """Give the client of two processes, the same for all tests; skip without Dask."""
     distributed = pytest.importorskip("distributed")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with cluster(2) as two, distributed.Client(two, set_as_default=False) as found:
-            yield found
+    with cluster(2) as two, distributed.Client(two, set_as_default=False) as found:
+        yield found
 
 
 @pytest.fixture(params=PAIRS)

@@ -176,6 +176,22 @@ def test_the_command_line_adjusts_by_a_scheduler(client: Any, tmp_path: Path, ru
     assert "--scheduler" in told
 
 
+@pytest.mark.slow
+def test_products_by_workers_solve_as_products_here_do(
+    client: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from epigauge.bundle import native_linearizer
+
+    if eg.kernels.available()["c"] is not None:
+        pytest.skip("the C library is not there")
+    tracks, start = metric(shared=False)
+    found = eg.distributed.bundle_adjust(tracks, client, start, solver="cg", max_iter=3)
+    monkeypatch.setattr(native_linearizer, "is_direct", lambda *_: False)
+    here = eg.bundle_adjust(tracks, start, max_iter=3)
+    assert found.cost == pytest.approx(here.cost, rel=1e-12)
+    assert found.nit == here.nit
+
+
 @pytest.mark.parametrize("count", [1, 2, 5, 8, 13])
 def test_sums_do_not_depend_on_where_they_are_made(count: int) -> None:
     rng = np.random.default_rng(count)

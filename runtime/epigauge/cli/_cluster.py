@@ -49,7 +49,7 @@ def local_client() -> Iterator[Any]:
     _check_package()
     from distributed import Client, LocalCluster
 
-    options: dict[str, Any] = {"dashboard_address": None, "silence_logs": logging.ERROR}
+    options: dict[str, Any] = {"dashboard_address": ":0", "silence_logs": logging.ERROR}
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     with (
         LocalCluster(n_workers=cores, threads_per_worker=1, **options) as workers,
