@@ -185,9 +185,9 @@ def test_products_by_workers_solve_as_products_here_do(
     if eg.kernels.available()["c"] is not None:
         pytest.skip("the C library is not there")
     tracks, start = metric(shared=False)
-    found = eg.distributed.bundle_adjust(tracks, client, start, solver="cg", max_iter=3)
+    found = eg.distributed.bundle_adjust(tracks, client, start, solver="cg", max_iter=1)
     monkeypatch.setattr(native_linearizer, "is_direct", lambda *_: False)
-    here = eg.bundle_adjust(tracks, start, max_iter=3)
+    here = eg.bundle_adjust(tracks, start, max_iter=1)
     assert found.cost == pytest.approx(here.cost, rel=1e-12)
     assert found.nit == here.nit
 
