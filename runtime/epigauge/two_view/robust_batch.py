@@ -75,9 +75,17 @@ class RobustBatch(FundamentalBatch):
     p_wrong: Array
 
     def probability_good(self, px: float) -> Array:
-        """Return the probability of each pair (n,) that its median error is below so many pixels.
+        """Return the probability of each pair that its median error is below so many pixels.
 
-        As of `RobustResult`; zero for a pair that was refused.
+        Parameters
+        ----------
+        px : float
+            Bound, in pixels.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            As of `RobustResult.probability_good`; zero for a pair that was refused.
         """
         good = probability_below(px, self.error_px, self.p_wrong)
         return np.where(self.status == REFUSED, 0.0, good)
