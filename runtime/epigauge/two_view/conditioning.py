@@ -62,6 +62,17 @@ class Conditioning:
         pixels = self._to_units(self.origin2).T @ F @ self._to_units(self.origin1)
         return np.asarray(pixels / np.linalg.norm(pixels))
 
+    def homography_from_pixels(self, H: Array) -> Array:
+        """Return the conditioned homography with unit Frobenius norm."""
+        to1, to2 = self.maps_from_pixels()
+        conditioned = to2 @ H @ np.linalg.inv(to1)
+        return np.asarray(conditioned / np.linalg.norm(conditioned))
+
+    def homography_to_pixels(self, H: Array) -> Array:
+        """Return a homography for pixels, of any scale."""
+        to1, to2 = self.maps_from_pixels()
+        return np.asarray(np.linalg.inv(to2) @ H @ to1)
+
     def entry_map(self) -> Array:
         """Return the (9, 9) matrix from vect(F) conditioned to vect(F) for pixels."""
         product = np.kron(self._to_units(self.origin2).T, self._to_units(self.origin1).T)

@@ -178,10 +178,7 @@ def _start(
 ) -> Array:
     """Return the start in conditioned coordinates, of unit norm."""
     if H0 is not None:
-        given = as_fundamental(H0, "H0")
-        to1, to2 = frame.maps_from_pixels()
-        H = to2 @ given @ np.linalg.inv(to1)
-        return np.asarray(H / np.linalg.norm(H))
+        return frame.homography_from_pixels(as_fundamental(H0, "H0"))
     counts = w > 0.0
     some = (np.ascontiguousarray(q1[:, counts]), np.ascontiguousarray(q2[:, counts]))
     if loss == "linear":

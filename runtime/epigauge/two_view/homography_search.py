@@ -193,7 +193,7 @@ def estimate_homography(
         if is_open or inlier.tobytes() in tried:
             break
         tried.add(inlier.tobytes())
-        H0: Array | None = frame_to_pixels(frame, H)
+        H0: Array | None = frame.homography_to_pixels(H)
         used = inlier
         while True:
             chosen = of_matches(options, len(x1), rows[used])
@@ -205,9 +205,7 @@ def estimate_homography(
                     raise
             # All that agree are in one place or on one line, and leave H open: fitted to all
             used, H0, is_open = np.ones(len(rows), np.bool_), None, True
-        to1, to2 = frame.maps_from_pixels()
-        H = to2 @ result.H @ np.linalg.inv(to1)
-        H /= np.linalg.norm(H)
+        H = frame.homography_from_pixels(result.H)
     assert result is not None
     bound = min(limit, CEILING * RANGE)  # within more, wrong matches agree, too
     agreed = int(np.count_nonzero(plane_squares(table, H, q1, q2)[used] <= bound**2))
@@ -222,12 +220,6 @@ def estimate_homography(
     agrees = (inlier if is_open else used)[copies]
     result = replace(result, inlier=agrees, used=rows[used], threshold_px=limit * frame.scale)
     return with_flags(result, flags)
-
-
-def frame_to_pixels(frame: Any, H: Array) -> Array:
-    """Return a conditioned homography in pixels."""
-    to1, to2 = frame.maps_from_pixels()
-    return np.asarray(np.linalg.inv(to2) @ H @ to1)
 
 
 def _agreement(squared: Array) -> float:

@@ -24,6 +24,7 @@ from epigauge.errors import ArgumentError
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.consensus import RANGE, Consensus
 from epigauge.two_view.copies import earliest
+from epigauge.two_view.homography import plane_squares
 from epigauge.two_view.homography_result import HomographyResult
 from epigauge.two_view.homography_search import PlaneMixture, estimate_homography
 from epigauge.two_view.refine import calibrations
@@ -281,7 +282,6 @@ def _evidence(
     y1, y2 = x1[rows], x2[rows]
     frame = condition(y1, y2)
     table, (q1, q2) = kernels.table(backend), frame.forward(y1, y2)
-    to1, to2 = frame.maps_from_pixels()
     m = len(rows)
     wrong = -2.0 * m * math.log(RANGE)
     found: dict[str, dict[str, float]] = {}
@@ -293,10 +293,7 @@ def _evidence(
         found[model] = {"log_likelihood": gain, "parameters": parameters, "score": score}
 
     def squares(H: Array) -> Array:
-        H = to2 @ H @ np.linalg.inv(to1)
-        with np.errstate(all="ignore"):
-            squared = table.homography_squared(H / np.linalg.norm(H), q1, q2)
-        return np.asarray(np.where(np.isfinite(squared), squared, np.inf))
+        return plane_squares(table, frame.homography_from_pixels(H), q1, q2)
 
     add("nothing", wrong)
     add("still", PlaneMixture.of(squares(np.eye(3)), SCALES[0]).logarithm)
