@@ -211,7 +211,7 @@ def help_of(command: Command | None, run: Runner) -> list[str]:
             for flag in option.flags
             if not option.argument and not re.search(rf"(?<![\w-]){flag}(?![\w-])", text)
         ]
-        if not option.help.strip():
+        if not (option.argument or option.help.strip()):
             problems.append(f"{where} says nothing of {option.name}")
         problems += [
             f"{where} misses or breaks the choice {choice} of {option.name}"

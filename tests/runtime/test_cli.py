@@ -155,7 +155,7 @@ def test_a_bad_file_is_one_clear_line_and_exit_2(run, tmp_path, content, words) 
         (["--backend", "fortran"], "backend is 'fortran'"),
         (["--noise-px", "0"], "noise_px is 0.0; needed: a finite number > 0"),
         (["--max-iter", "0"], "max_iter"),
-        (["--plot", "picture.pdf"], "picture.pdf"),
+        (["--plot", "picture.gif"], "picture.gif"),
         (["-o", "result.pkl"], "result.pkl"),
         (["-o", "absent/result.npz"], "epigauge: absent: No such file or directory"),
         (["--inliers"], "marks no inliers"),

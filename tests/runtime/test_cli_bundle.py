@@ -348,7 +348,7 @@ def test_a_bad_file_is_one_clear_line_and_exit_2(
         (["--loss", "l3"], "loss is 'l3'"),
         (["--max-iter", "0"], "max_iter"),
         (["--clean"], "marks nothing as clean"),
-        (["--plot", "b.pdf"], "b.pdf"),
+        (["--plot", "b.gif"], "b.gif"),
         (["-o", "r.json"], "r.json"),
         (["-o", "absent/r.npz"], "absent: No such file or directory"),
         (["--plot", "absent/r.html"], "absent: No such file or directory"),
