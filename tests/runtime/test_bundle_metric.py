@@ -13,6 +13,7 @@ from bundle_scenes import CASES, PRIORS, problem_of, scene
 from epigauge.bundle import compiled
 from epigauge.bundle import problem as problem_module
 from epigauge.bundle.dampings import Covariant
+from epigauge.bundle.diagnosis import _open as open_directions
 from epigauge.bundle.jobs import metric_job
 from epigauge.bundle.problem import BundleProblem, BundleState
 from epigauge.bundle.solve import Step
@@ -349,3 +350,14 @@ def test_gauge_groups_are_those_of_the_cameras() -> None:
         eg.gauge.transform(start, np.eye(4))
     with pytest.raises(eg.ArgumentError, match="reflection"):
         eg.gauge.similarity(1.0, -np.eye(3), np.zeros(3))
+
+
+def test_points_of_one_line_of_sight_are_counted_in_silence():
+    # Of rank one but for rounding, which leaves pivots of zero and of minus infinity.
+    block = [
+        [5.070977422640635e20, 1.1890489270433374e20, 1.1492828253583953e20],
+        [1.1890489270433374e20, 2.7880963235814953e19, 2.694852286780884e19],
+        [1.1492828253583953e20, 2.694852286780884e19, 2.604726668208991e19],
+    ]
+    sizes = 1.8700865739398945e20 * np.eye(3)
+    assert open_directions(np.array([block]), sizes[None]) == 2

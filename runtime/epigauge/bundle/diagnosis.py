@@ -182,7 +182,8 @@ def _open(blocks: Array, sizes: Array) -> int:
     size = np.ascontiguousarray(sizes.reshape(len(sizes), b * b)[:, :: b + 1].T)
     if b == 3:
         pivots = np.stack(Triangle.of(blocks)[3:]) / size
-        determinants = pivots[0] * pivots[1] * pivots[2]
+        with np.errstate(invalid="ignore", over="ignore"):
+            determinants = pivots[0] * pivots[1] * pivots[2]
         traces = np.sum(blocks.reshape(-1, 9)[:, ::4].T / size, axis=0)
         doubtful = ~(determinants > 100.0 * _ROUNDING * np.maximum(traces / 2.0, 1.0) ** 2)
     else:
