@@ -77,3 +77,44 @@ def test_constants_cannot_be_refined(name):
     constant = models()[name].constants[0]
     with pytest.raises(eg.errors.ArgumentError, match=constant):
         eg.bundle_adjust(tracks, scene, refine=(constant,))
+
+
+#: Its correction folds at an ideal radius of 385 pixels.
+FOLDED = [1000.0, 500.0, 400.0, -1e-6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("backend", [None, "numpy"])
+def test_what_a_correction_folds_away_has_no_image(backend):
+    cameras = eg.Cameras("brown_measured", [FOLDED], [0, 0])
+    radius = np.array([0.05, 0.2, 0.384, 0.386, 0.5, 0.6, 2.0])
+    X = np.column_stack([-0.8 * radius, 0.6 * radius, np.full(7, -1.0)])
+    scene = eg.MetricReconstruction([np.eye(3)] * 2, np.zeros((2, 3)), X, cameras)
+    point, view = np.divmod(np.arange(14), 2)
+    xy = scene.project(eg.Tracks(view, point, np.zeros((14, 2))), backend).reshape(7, 2, 2)
+    assert np.isposinf(xy[3:]).all()
+    # The corrections of the others are the images of an ideal lens.
+    away = xy[:3, 0] - FOLDED[1:3]
+    corrected = away * (1.0 + FOLDED[3] * np.sum(away**2, axis=1, keepdims=True))
+    np.testing.assert_allclose(corrected, -1000.0 * X[:3, :2] / X[:3, 2:], rtol=1e-6)
+
+
+def test_a_measurement_beyond_the_fold_is_a_gross_error():
+    rng = np.random.default_rng(1)
+    n, m = 4, 30
+    X = np.column_stack([rng.uniform(-1.0, 1.0, (m, 2)), rng.uniform(-7.0, -5.0, m)])
+    t = np.column_stack([rng.uniform(-0.5, 0.5, (n, 3))])
+    cameras = eg.Cameras("brown_measured", [FOLDED], [0] * n)
+    scene = eg.MetricReconstruction([np.eye(3)] * n, t, X, cameras)
+    point, view = np.divmod(np.arange(n * m), n)
+    xy = scene.project(eg.Tracks(view, point, np.zeros((n * m, 2))))
+    xy += 0.3 * rng.standard_normal(xy.shape)
+    xy[17] = 2500.0, 400.0
+    tracks = eg.Tracks(view, point, xy)
+    bent = eg.bundle_adjust(tracks, scene, refine="pose")
+    assert "gross errors" in bent.flags
+    assert not bent.success
+    assert not np.isnan(bent.fun).any()
+    found = eg.bundle_adjust(tracks, scene, refine="pose", robust=True)
+    assert found.success
+    assert found.rms_px < 0.4
+    np.testing.assert_array_equal(np.flatnonzero(found.rejected), [17])

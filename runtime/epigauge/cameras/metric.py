@@ -196,15 +196,14 @@ class MetricReconstruction(ReconstructionBase):
     def _images(self, tracks: Tracks, backend: str | None) -> tuple[Array, Array]:
         """Return pixels (2, N) and depths (N,)."""
         self.check_fits(tracks)
-        project = camera_model(self.cameras.model).kernel("project", backend)
+        model = camera_model(self.cameras.model)
         cameras, points = (np.ascontiguousarray(rows.T) for rows in (self.vectors, self.X))
         pixels, depths = np.empty((2, len(tracks))), np.empty(len(tracks))
         for begin in range(0, len(tracks), _BLOCK):
             part = slice(begin, begin + _BLOCK)
             view, point = tracks.view[part], tracks.point[part]
-            with np.errstate(all="ignore"):
-                seen = project(np.take(cameras, view, axis=1), np.take(points, point, axis=1))
-            pixels[:, part], depths[part] = seen
+            at = np.take(cameras, view, axis=1), np.take(points, point, axis=1)
+            pixels[:, part], depths[part] = model.seen(*at, backend)
         return pixels, depths
 
     def _calibrations(self) -> Array:

@@ -11,17 +11,23 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from epigauge_generated import signatures
+from numpy.typing import NDArray
 
 from epigauge import kernels
 from epigauge.errors import ArgumentError
 
 __all__ = ["CameraModel", "camera_model", "models"]
 
+Array = NDArray[np.float64]
 Kernel = Callable[..., Any]
 
 _FOCAL = ("f", "fx", "fy", "c")
 _SIDES = ("width", "height")
+
+#: A measured point whose correction is farther than this from the image, of its size, is another's.
+_MISSED = 1e-6
 
 
 @dataclass(frozen=True)
@@ -98,6 +104,36 @@ class CameraModel:
         """
         found: Kernel = getattr(kernels.table(backend), f"{self.prefix}_{name}")
         return found
+
+    def seen(
+        self, cameras: Array, points: Array, backend: str | None = None
+    ) -> tuple[Array, Array]:
+        """Return pixels and depths of points.
+
+        Parameters
+        ----------
+        cameras, points : ndarray, shape (c, N), (b, N)
+            One column an observation.
+        backend : {"c", "numpy", "casadi"}, optional
+            By default the active one.
+
+        Returns
+        -------
+        pixels, depths : ndarray, shape (2, N), (N,)
+            Infinite or NaN where the model has no image of a point; infinite, too, where the
+            correction of a measured point folds: Newton steps lead anywhere there.
+        """
+        with np.errstate(all="ignore"):
+            pixels, depths = map(np.array, self.kernel("project", backend)(cameras, points))
+            if self.corrects:
+                params = np.ascontiguousarray(cameras[self.camera_size - len(self.params) :])
+                slope = self.kernel("correct", backend)(pixels, params)[1]
+                missed = np.abs(self.kernel("residual", backend)(cameras, points, pixels))
+                size = np.maximum(np.abs(pixels).max(axis=0), 1.0)
+                upright = slope[0, 0] * slope[1, 1] > slope[0, 1] * slope[1, 0]
+                upright &= slope[0, 0] + slope[1, 1] > 0.0
+                pixels[:, ~(upright & (missed.max(axis=0) <= _MISSED * size))] = np.inf
+        return pixels, depths
 
 
 _MODELS = {

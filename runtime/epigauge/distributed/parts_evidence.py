@@ -166,10 +166,9 @@ class PartsEvidence:
         """Return the points (k,) that a view sees, and where it projects them to, (k, 2)."""
         view, point = self._joined("around", i)
         seen, found = point[view == i], self._found
-        project = camera_model(found.cameras.model).kernel("project")
         camera = np.repeat(found.vectors[i][:, None], len(seen), axis=1)
-        with np.errstate(all="ignore"):
-            pixels, _ = project(camera, np.ascontiguousarray(found.X[seen].T))
+        at = camera, np.ascontiguousarray(found.X[seen].T)
+        pixels, _ = camera_model(found.cameras.model).seen(*at)
         return seen, np.ascontiguousarray(pixels.T)
 
     def moved(self, limit: float) -> float:

@@ -82,11 +82,11 @@ def _values(own: Evaluation, cameras: Array, points: Array, weighted: bool, what
 
 def _residuals(own: Evaluation, cameras: Array, points: Array) -> tuple[Array, Array]:
     """Return the residuals (2, N), as they are, and the depths (N,)."""
-    graph, project = own.graph, own.model.kernel("project", own.setup.backend)
+    graph = own.graph
     seen_by = np.take(np.ascontiguousarray(cameras[own.views].T), graph.view, axis=1)
-    with np.errstate(all="ignore"):
-        pixels, depths = project(seen_by, np.take(points.T, graph.point, axis=1))
-        return own.q - pixels, np.asarray(depths)
+    at = seen_by, np.take(points.T, graph.point, axis=1)
+    pixels, depths = own.model.seen(*at, own.setup.backend)
+    return own.q - pixels, depths
 
 
 def _distances(own: Evaluation, residuals: Array, weighted: bool) -> Array:

@@ -231,8 +231,6 @@ class GaugeFree:
             carried[3:, :3] = np.cross(np.eye(3), arm).T
             parts = [("camera", relative_to), *parts]
         xy, slopes = self._projected(turn, place, camera, point)
-        if not np.isfinite(xy).all():
-            raise ArgumentError("point", f"is {point}, of which the view has no image", "another")
         own = slopes[:, :_POSE]
         of_parts, of_pose = np.hstack([own @ carried, slopes[:, _POSE:]]), own @ axes
         found = of_parts @ self.joint(parts) @ of_parts.T + of_pose @ spread @ of_pose.T
@@ -247,8 +245,11 @@ class GaugeFree:
         known = camera_model(scene.cameras.model)
         pose = np.column_stack([R, -R @ centre])
         vector = np.concatenate([pose.ravel(), scene.cameras.params[camera]])
+        pixels, _ = known.seen(vector[:, None], scene.X[point][:, None])
+        xy = pixels[:, 0]
+        if not np.isfinite(xy).all():
+            raise ArgumentError("point", f"is {point}, of which the view has no image", "another")
         with np.errstate(all="ignore"):
-            xy, _ = known.kernel("project")(vector, scene.X[point])
             _, J, J_point = known.kernel("observe")(vector, scene.X[point], xy)
         if known.corrects:  # J is that of the corrected point
             slope = known.kernel("correct")(xy, scene.cameras.params[camera])[1]

@@ -93,8 +93,9 @@ class EvidenceOfTracks:
         """Return the weighted lengths of the residuals that count."""
         tracks = self.tracks
         counts, xy = tracks.weights > 0.0, tracks.xy
-        r = whitened(tracks.whitening, (xy - self.predicted).T)
-        distances = np.sqrt(tracks.weights * (r[0] ** 2 + r[1] ** 2))
+        with np.errstate(invalid="ignore", over="ignore"):
+            r = whitened(tracks.whitening, (xy - self.predicted).T)
+            distances = np.sqrt(tracks.weights * (r[0] ** 2 + r[1] ** 2))
         if not counts.all():
             distances, xy = distances[counts], xy[counts]
         return TailOfArrays(distances, xy)

@@ -79,10 +79,12 @@ def judged_metric(
     raised = {"behind the cameras"} if n_behind > BEHIND * evidence.count else set()
     system, rank = outcome.system, 0
     condition, weakest = float("inf"), ""
-    if isinstance(system, BundleSystem) and np.isfinite(outcome.state.cost):
+    tail, scale = evidence.tail, evidence.scale
+    if not np.isfinite(tail.sum_of_squares):  # measured points that the cameras have no image of
+        raised.add("gross errors")
+    elif isinstance(system, BundleSystem) and np.isfinite(outcome.state.cost):
         diagnosis = diagnosed(system, kernels, known, fixes_gauge)
         rank, condition = diagnosis.rank, diagnosis.condition
-        tail, scale = evidence.tail, evidence.scale
         share_free = max(1.0 - rank / max(2 * tail.count, 1), 1e-3)
         # Of two normal coordinates, the median distance is 1.1774 standard deviations.
         usual = tail.median / 1.1774 / float(np.sqrt(share_free))
