@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import epigauge as eg
@@ -200,3 +201,23 @@ def test_damaged_caches_are_named_and_left_as_they_are(tmp_path: Path) -> None:
         assert (tmp_path / "d.npz").read_bytes() == data
     # The archive has check sums: hardly anything passes.
     assert refused >= 44
+
+
+def test_matches_of_places_that_are_no_numbers_are_refused() -> None:
+    matches, _ = pairwise(n=3)
+    rows = matches.pairs[0, 1]
+    matches.points[1][rows[0, 1]] = np.nan
+    with pytest.raises(eg.ArgumentError, match=r"of image 1 .* not all finite"):
+        replace(matches)
+
+
+@pytest.mark.parametrize("name", ["count", "matches"])
+def test_caches_with_other_counts_are_refused(name: str, tmp_path: Path) -> None:
+    matches, _ = pairwise(n=3)
+    matches.save(tmp_path / "c.npz")
+    with np.load(tmp_path / "c.npz") as file:
+        arrays = dict(file)
+    arrays[name] = arrays[name] - 5
+    np.savez(tmp_path / "c.npz", **arrays)
+    with pytest.raises(eg.FileFormatError):
+        eg.PairwiseMatches.load(tmp_path / "c.npz")

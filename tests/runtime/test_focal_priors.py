@@ -64,6 +64,24 @@ def test_without_it_the_pitch_of_the_sensor_tells(tmp_path: Path, unit: int, per
     assert exif_focal_px(path, (1000, 750)) == pytest.approx(8.5 * 12000.0 * per_mm / 4.0)
 
 
+def test_other_forms_have_it_in_other_places(tmp_path: Path) -> None:
+    block = _exif([(0xA405, 3, 50)], "<")
+    chunk = struct.pack("<4sI", b"EXIF", len(block)) + block
+    pixels = bytes(2**20)  # before what is looked for
+    forms = {
+        "a.webp": b"RIFF"
+        + struct.pack("<I", 4 + len(pixels) + len(chunk))
+        + b"WEBP"
+        + pixels
+        + chunk,
+        "a.png": b"\x89PNG\r\n\x1a\n" + pixels + struct.pack(">I4s", len(block), b"eXIf") + block,
+        "a.heic": b"\0\0\0\x18ftypheic" + pixels + b"\0\0\0\x06Exif\0\0" + block,
+    }
+    for name, data in forms.items():
+        (tmp_path / name).write_bytes(data)
+        assert exif_focal_px(tmp_path / name, (3000, 2000)) == pytest.approx(50.0 / 36.0 * 3000.0)
+
+
 def test_files_that_tell_nothing_are_no_error(tmp_path: Path) -> None:
     whole = _jpeg(_exif([(0xA405, 3, 50)], "<"))
     damaged = [b"", b"II*\0", b"\xff\xd8\xff\xd9", _jpeg(_exif([(0xA405, 3, 0)], ">"))]

@@ -21,11 +21,11 @@ _RESOLUTION, _UNIT, _EQUIVALENT = 0xA20E, 0xA210, 0xA405
 #: Millimetres of units of resolution: inch (by default) and centimetre.
 _MILLIMETRES = {2: 25.4, 3: 10.0}
 
+#: How TIFF and EXIF data begin, by the order of their bytes.
+_TIFF = (b"II*\0", b"MM\0*")
+
 #: Formats of one number each: size, and code of `struct`; rational numbers are pairs.
 _FORMATS = {3: "H", 4: "I", 5: "II", 9: "i", 10: "ii"}
-
-#: EXIF data stand in the first part of a file.
-_HEAD = 2**20
 
 
 def exif_focal_px(path: PathLike, image_size: tuple[int, int]) -> float | None:
@@ -50,10 +50,8 @@ def exif_focal_px(path: PathLike, image_size: tuple[int, int]) -> float | None:
     OSError
         If the file cannot be read.
     """
-    with Path(path).open("rb") as file:
-        data = file.read(_HEAD)
     try:
-        tags = _tags(data)
+        tags = _tags(Path(path).read_bytes())  # the whole file: TIFF and WebP have it at the end
     except (struct.error, ValueError):
         return None
     equivalent, focal = tags.get(_EQUIVALENT, 0.0), tags.get(_FOCAL, 0.0)
@@ -68,15 +66,15 @@ def exif_focal_px(path: PathLike, image_size: tuple[int, int]) -> float | None:
 
 def _tags(data: bytes) -> dict[int, float]:
     """Return the numbers of the EXIF block."""
-    at = 0 if data[:4] in (b"II*\0", b"MM\0*") else data.find(b"Exif\0\0") + 6
-    if at < 6 and at != 0:
-        at = data.find(b"eXIf") + 4  # PNG
-        if at < 4:
-            return {}
-    block = data[at:]
-    order = "<" if block[:2] == b"II" else ">"
-    if block[:4] not in (b"II*\0", b"MM\0*"):
+    block = data
+    if data[:4] not in _TIFF:
+        # JPEG and HEIC; PNG; WebP, whose chunk has a size.
+        marks = ((b"Exif\0\0", 6), (b"eXIf", 4), (b"EXIF", 8))
+        found = [(data.find(mark), length) for mark, length in marks]
+        block = next((data[at + length :] for at, length in found if at >= 0), b"")
+    if block[:4] not in _TIFF:
         return {}
+    order = "<" if block[:2] == b"II" else ">"
     first = _directory(block, order, int(struct.unpack_from(order + "I", block, 4)[0]))
     inner = int(first.get(_EXIF, 0.0))
     return _directory(block, order, inner) if inner else {}

@@ -98,6 +98,10 @@ class PairwiseMatches:
                 raise ArgumentError(
                     "pairs", f"names features of images {i} and {j} that are not", "rows of points"
                 )
+            for k, own in zip((i, j), rows.T, strict=True):
+                if not np.isfinite(np.asarray(self.points[k], dtype=np.float64)[own]).all():
+                    was = f"of image {k} ({self.names[k]}) that match are not all finite"
+                    raise ArgumentError("points", was, "finite coordinates")
 
     def save(self, path: PathLike) -> None:
         """Write everything to an NPZ file.
@@ -144,6 +148,9 @@ class PairwiseMatches:
             # NumPy leaves a file that it opened itself open where it is damaged.
             with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as data:
                 z = {key: data[key] for key in data.files}
+            features, matches = int(z["count"].sum()), int(z["matches"].sum())
+            if (features, matches) != (len(z["points"]), len(z["rows"])):
+                raise ValueError("counts are not those of features and matches")
             ends = np.cumsum(z["count"])[:-1]
             parts = np.split(z["rows"].astype(np.intp), np.cumsum(z["matches"])[:-1])
             images = map(tuple, z["images"].tolist())
