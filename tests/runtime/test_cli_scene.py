@@ -14,6 +14,8 @@ pytest.importorskip("typer", reason="the command line needs typer")
 pytest.importorskip("rich", reason="the command line needs rich")
 pytest.importorskip("cv2", reason="photographs need OpenCV")
 
+from epigauge.cli.scene import _photographs
+
 
 def test_a_database_becomes_a_scene(run, tmp_path: Path) -> None:
     database = Project(n_views=4, n_points=150).write(tmp_path / "database.db")
@@ -80,3 +82,20 @@ def test_bad_input_ends_with_two(run, tmp_path: Path) -> None:
     (poster, *_) = _poster(tmp_path, 0)
     assert run("scene", poster, "-o", output)[0] == 2
     assert run("scene", poster, poster, "--cameras", "two", "-o", output)[0] == 2
+    code, _, err = run("scene", poster, poster, "--cache", tmp_path / "no" / "c.npz", "-o", output)
+    assert code == 2
+    assert "no: No such file or directory" in err
+
+
+@pytest.mark.parametrize("ending", [".JPG", ".heic"])
+def test_photographs_in_a_folder_are_found_by_their_endings(ending: str, tmp_path: Path) -> None:
+    for name in (f"a{ending}", "b.png", "c.txt"):
+        (tmp_path / name).touch()
+    assert [path.name for path in _photographs([tmp_path])] == [f"a{ending}", "b.png"]
+
+
+def test_it_is_said_when_no_photograph_tells_its_focal_length(run, tmp_path: Path) -> None:
+    photographs = [eg.samples.path(f"room{k}.jpg") for k in range(3)]
+    options = ["--exif-focal", "--max-features", "1500", "-o", tmp_path / "scene"]
+    _, _, err = run("scene", *photographs, *options)
+    assert "focal lengths of none of 3 photographs" in err

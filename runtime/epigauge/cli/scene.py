@@ -21,6 +21,7 @@ import epigauge as eg
 from epigauge.cameras import camera_model
 from epigauge.cli._common import DONE, NOT_CONVERGED, console, facts, shown
 from epigauge.cli._scenes import save_cloud
+from epigauge.cli._targets import check_folder
 from epigauge.cli.metric import camera_rows
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.images.exif import exif_focal_px
@@ -40,7 +41,10 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 #: Photographs in a folder are files with these endings.
-_PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".ppm", ".pgm")
+_PHOTOS = (
+    *(".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".ppm", ".pgm"),
+    *(".heic", ".heif"),
+)
 #: Share of a nominal focal length that it is uncertain by, and that a zoom changes it by.
 _NOMINAL, _ZOOMED = 0.1, 0.02
 
@@ -79,12 +83,14 @@ def scene(
 ) -> int:
     """Reconstruct a scene from photographs, knowing nothing of the cameras.
 
-    Writes into the folder a COLMAP model (sparse/0; sparse_text as text), points.ply in colours,
-    scene.npz, report.json with all that is known, and index.html to turn the scene about.
+    Writes into the folder a COLMAP model (sparse/0; sparse_text as text),
+    points.ply in colours, scene.npz, report.json with all that is known, and
+    index.html to turn the scene about.
 
-    Photographs that do not belong to the others are left out, and it is said why. Exit code 1
-    with a sentence where there is no scene: photographs that do not match, of something
-    flat, or by a camera that only turned. Then nothing is written.
+    Photographs that do not belong to the others are left out, and it is said
+    why. Exit code 1 with a sentence where there is no scene: photographs that
+    do not match, of something flat, or by a camera that only turned. Then
+    nothing is written.
     """
     if cameras not in ("auto", "one", "own", "size"):
         raise ArgumentError("--cameras", f"is {cameras!r:.60}", "auto, one, own or size")
@@ -92,6 +98,8 @@ def scene(
         raise ArgumentError("--output", f"exists: {shown(output)}", "a new or an empty folder")
     if exif_focal and _is_database(sources):
         raise ArgumentError("--exif-focal", "is given with a database", "photographs")
+    if cache is not None:
+        check_folder(cache)
     begin, out = time.perf_counter(), console()
     photographs: dict[str, Path] = {}
     try:
@@ -109,7 +117,7 @@ def scene(
         out.print(f"[bold red]no scene:[/] the photographs {escape(error.was)}", soft_wrap=True)
         out.print(f"needed: {escape(error.needed)}", soft_wrap=True)
         return NOT_CONVERGED
-    answer = _Answer(tracks, result, photographs, time.perf_counter() - begin)
+    answer = _Answer(tracks, result, photographs, time.perf_counter() - begin, focal)
     answer.report(out)
     if not result.success:
         return NOT_CONVERGED
@@ -216,7 +224,10 @@ class _Answer:
         result: eg.MetricUpgrade,
         photographs: dict[str, Path],
         seconds: float,
+        focal: Array | None = None,
     ) -> None:
+        #: Focal lengths that the photographs tell, where they were asked for.
+        self.focal = focal
         self.tracks, self.result, self.seconds = tracks, result, seconds
         #: Files by the names of the views; none of a database.
         self.photographs = photographs
@@ -242,6 +253,9 @@ class _Answer:
             "photographs": f"{tracks.n_views} of {tracks.n_views + count}",
             "tracks": f"{tracks.n_points} points, {len(tracks)} observations",
         }
+        if self.focal is not None:
+            told = int(np.count_nonzero(np.isfinite(self.focal)))
+            rows["EXIF data"] = f"focal lengths of {told or 'none'} of {tracks.n_views} photographs"
         if result.reconstruction is not None:
             rows |= camera_rows(result, result.reconstruction.cameras)
             rejected = int(np.count_nonzero(result.rejected))
