@@ -139,6 +139,11 @@ def test_pictures_show_the_scene_in_its_own_shape(run, folder, tmp_path) -> None
         (("--gauge", "normalized"), "--gauge is given with a scene"),
         (("--start", "x.npz"), "--start is given with a scene"),
         (("--clean",), "--clean is given with a scene"),
+        (("--prune",), "--prune is given with a scene"),
+        (("--init", "registration"), "--init is given with a scene"),
+        (("-o", "o.html"), "the name of a picture"),
+        (("--precision", "p.gif"), "p.gif"),
+        (("--precision", "-", "--json"), "one of them alone"),
         (("--fix-view", "e.jpg"), "--fix-view is 'e.jpg'"),
         (("--fix-view", "4"), "0 to 3"),
         (("--refine", "focal"), "names 'focal'"),
@@ -219,6 +224,9 @@ def test_precision_is_told_in_a_table_in_json_and_in_pictures(run, folder, tmp_p
         assert line[4:] == ([unit] if unit != "1" else [])
     assert '"spread":{' in page.read_text(encoding="utf-8")
     assert picture.read_bytes()[:4] == b"\x89PNG"
+    both = [tmp_path / "q.svg", tmp_path / "q.html"]
+    assert run("bundle", folder, *(f"--precision={path}" for path in both))[0] == 0
+    assert all(path.stat().st_size > 1000 for path in both)
     document = json.loads(run("bundle", folder, "--refine", "f,k", "--json")[1])
     for entry, row in zip(document["intrinsics"], rows, strict=True):
         assert (entry["camera"], entry["name"], entry["unit"]) == (row[0], row[1], row[4])

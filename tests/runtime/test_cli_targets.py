@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 from collections.abc import Callable
 from pathlib import Path
@@ -95,3 +96,18 @@ def test_the_size_of_the_images_frames_the_picture() -> None:
     done = commands.in_process(*words, "512", "512", "--plot", "a.svg", "-o", "a.npz")
     assert done.check(0) == []
     assert commands.opened(Path("a.svg")) is None
+
+
+def test_no_help_is_wrapped_a_second_time() -> None:
+    """Lines below the first of a help are kept: what exceeds 78 columns stands alone."""
+    import typer
+    from epigauge.cli import app
+
+    group = typer.main.get_command(app)
+    long = [
+        (name, line)
+        for name, command in group.commands.items()  # type: ignore[attr-defined]
+        for line in inspect.cleandoc(command.help).splitlines()[1:]
+        if len(line) > 78
+    ]
+    assert long == []

@@ -438,6 +438,21 @@ def test_a_worker_that_dies_loses_no_part(
     the_same_bits(found, expected)
 
 
+@pytest.mark.parametrize(
+    "option",
+    [
+        *("--lines=x.csv", "--y-up", "--y-down", "--rigs=drop", "--init=registration"),
+        *("--gauge-mode=implicit", "--repeated=drop", "--precision=x.png", "--plot=x.png"),
+    ],
+)
+def test_the_command_line_refuses_what_parts_cannot_have(
+    written: Path, run: Any, option: str
+) -> None:
+    code, out, err = run("bundle", written, option)
+    assert (code, out) == (2, "")
+    assert f"{option.partition('=')[0]} is given with a folder of parts" in err
+
+
 @pytest.mark.slow
 def test_the_command_line_adjusts_parts(
     client: Any, scene: Scene, written: Path, tmp_path: Path, run: Any

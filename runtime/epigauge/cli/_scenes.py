@@ -30,7 +30,7 @@ from epigauge.cli._common import (
 )
 from epigauge.cli._live import watching
 from epigauge.cli._tables import save_line_residuals, save_residuals
-from epigauge.cli._targets import PICTURES, Targets, check_folder, check_target, save_drawing
+from epigauge.cli._targets import PICTURES, Targets, check_folder, save_drawing
 from epigauge.errors import ArgumentError
 from epigauge.io import SceneSource, load_line_tracks, load_scene, plain, save_ply, save_scene
 from epigauge.io._npz_scene import write_npz_scene
@@ -69,6 +69,15 @@ def refuse_options(options: Mapping[str, Any]) -> None:
         if value is not None:
             option = f"--{name.replace('_', '-')}"
             raise ArgumentError(option, "is given with a scene", "tracks without cameras")
+
+
+def of_tracks(init: str, prune: bool, repeated: str) -> dict[str, object]:
+    """Return the options for tracks of cameras that are to be found, None where not given."""
+    return {
+        "init": None if init == "auto" else init,
+        "prune": prune or None,
+        "repeated": None if repeated == "first" else repeated,
+    }
 
 
 def save_cloud(
@@ -145,12 +154,10 @@ class SceneJob:
         plot: Sequence[Path] | None,
         output: Sequence[Path] | None,
         json: bool,
-        precision: Path | None = None,
+        precision: Sequence[Path] | None = None,
     ) -> int:
         """Adjust the scene and write what is asked for; return the exit code."""
-        targets = Targets(plot, output, json=json, check=self._check_target)
-        if precision is not None:
-            check_target(precision, *PICTURES)
+        targets = Targets(plot, output, json=json, check=self._check_target, precision=precision)
         options = dict(options)
         adjust: Callable[..., eg.BundleResult] = options.pop("adjust")
         out = console()
@@ -170,8 +177,7 @@ class SceneJob:
         answer = _SceneAnswer(self, result, time.perf_counter() - begin, str(options["loss"]))
         targets.save(answer.save)
         targets.draw(answer.draw)
-        if precision is not None:
-            answer.draw_precision(precision)
+        targets.draw_precision(answer.draw_precision)
         if json:
             write_json(answer.document())
         else:
@@ -196,6 +202,9 @@ class SceneJob:
         check_folder(path)
         if path.suffix.lower() in (".ply", ".csv"):
             return
+        if path.suffix.lower() in PICTURES and not path.is_dir():
+            was = f"is {str(path)!r}, which is the name of a picture, not of a folder"
+            raise ArgumentError("-o", was, "a name without this ending, or --plot")
         if self.lines is not None and path.suffix.lower() != ".npz":
             was = f"is {str(path)!r}, a form that has no place for lines"
             raise ArgumentError("-o", was, "a name ending in .npz, .ply or .csv")

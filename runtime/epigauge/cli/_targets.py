@@ -86,6 +86,8 @@ class Targets:
         Whether JSON goes to stdout.
     check : callable, optional
         Checks a target of ``-o`` where other things than suffixes are to be seen to.
+    precision : sequence of Path, optional
+        What ``--precision`` was given: pictures as those of ``--plot``.
     """
 
     def __init__(
@@ -96,15 +98,18 @@ class Targets:
         *,
         json: bool = False,
         check: Callable[[Path], object] | None = None,
+        precision: Sequence[Path] | None = None,
     ) -> None:
         self.plots, self.outputs = list(plot or ()), list(output or ())
-        dashes = [path for path in (*self.plots, *self.outputs) if path == _STDOUT]
+        self.maps = list(precision or ())
+        pictures = [*self.plots, *self.maps]
+        dashes = [path for path in (*pictures, *self.outputs) if path == _STDOUT]
         if len(dashes) + json > 1:
-            was = "is wanted for more than one of -o -, --plot - and --json"
+            was = "is wanted for more than one of -o -, --plot -, --precision - and --json"
             raise ArgumentError("stdout", was, "one of them alone")
         #: Whether a file goes to stdout, in place of lines.
         self.on_stdout = bool(dashes)
-        for path in self.plots:
+        for path in pictures:
             check_target(path, *PICTURES)
         for path in self.outputs:
             if check is None or path == _STDOUT:
@@ -119,6 +124,10 @@ class Targets:
     def draw(self, write: Callable[[Path], object]) -> None:
         """Write the pictures, each by a function of its path."""
         _write(self.plots, ".png", write)
+
+    def draw_precision(self, write: Callable[[Path], object]) -> None:
+        """Write the pictures of precision, each by a function of its path."""
+        _write(self.maps, ".png", write)
 
 
 def _write(paths: Iterable[Path], form: str, write: Callable[[Path], object]) -> None:

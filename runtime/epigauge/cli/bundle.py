@@ -46,6 +46,7 @@ from epigauge.cli._scenes import (
     Refine,
     Rigs,
     SceneJob,
+    of_tracks,
     refuse_options,
     save_cloud,
 )
@@ -95,9 +96,11 @@ TracksFile = Annotated[
 
 
 Precision = Annotated[
-    Path | None,
+    list[Path] | None,
     typer.Option(
-        help="Of a scene: draw sigma of intrinsics and maps of precision: PNG, PDF, SVG or HTML."
+        help="Of a scene: draw sigma of intrinsics and maps of precision: PNG, PDF, SVG or HTML. "
+        "Or - for PNG on stdout. Several.",
+        show_default=False,
     ),
 ]
 
@@ -180,8 +183,8 @@ def bundle(
 
     Starts from two views and registers the others in turn, or from random
     cameras where that fails, and minimises the reprojection error in a
-    projective basis. Writes the cameras to stdout, one
-    line of 12 numbers each, row by row; with --json everything known.
+    projective basis. Writes the cameras to stdout, one line of 12 numbers
+    each, row by row; with --json everything known.
 
     A scene is a COLMAP folder, an NPZ file of `eg.save_scene` or, with
     --refine or --image-size, a BAL file: it has calibrated cameras and points
@@ -206,14 +209,24 @@ def bundle(
     if is_parts(tracks):
         refuse({"gauge": gauge, "start": start, "colmap": colmap, "clean": clean, "prune": prune})
         refuse({"damping": damping, "robust": robust, "plot": plot, "precision": precision})
-        refuse({"method": method != "covariant", "image_size": image_size})
+        refuse({"method": method != "covariant", "image_size": image_size, "lines": lines})
+        refuse({"init": init != "auto", "gauge_mode": gauge_mode != "explicit"})
+        refuse({"repeated": repeated != "first", "rigs": rigs != "keep"})
+        if y_up is not None:
+            refuse({"y_up" if y_up else "y_down": True})
         known: dict[str, Any] = {"loss": loss, "max_iter": max_iter, "backend": backend}
         where = scheduler, memory_limit
         return adjust_folder(tracks, *where, refine, fix_view or [], output or [], json, **known)
     if memory_limit is not None:
         raise ArgumentError("--memory-limit", "is given without parts", "a folder of parts")
     if refine is not None or image_size is not None or is_scene(tracks):
-        others = {"gauge": gauge, "start": start, "colmap": colmap, "clean": clean or None}
+        others: dict[str, Any] = {
+            "gauge": gauge,
+            "start": start,
+            "colmap": colmap,
+            "clean": clean or None,
+        }
+        others |= of_tracks(init, prune, repeated)
         asked: dict[str, Any] = {
             "method": method,
             "damping": damping,

@@ -67,8 +67,8 @@ def colmap(
 
     With --from-matches, the raw matches of all pairs that are not verified yet
     are, as by COLMAP's geometric verification: the lines are F of the pairs with
-    general motion. With --write, what each pair is, its inliers and its F, E and H
-    are stored; a second run goes on where the first one was stopped.
+    general motion. With --write, what each pair is, its inliers and its F, E
+    and H are stored; a second run goes on where the first one was stopped.
 
     Pairs that cannot be read or used are named with the reason and skipped; the
     others are done, with exit code 0. It is 2 where all are skipped.

@@ -25,7 +25,7 @@ from epigauge.cli._common import (
     write_json,
 )
 from epigauge.cli._live import watching
-from epigauge.cli._scenes import FixView, Refine, SceneJob, refuse_options
+from epigauge.cli._scenes import FixView, Refine, SceneJob, of_tracks, refuse_options
 from epigauge.cli._targets import Plot, Targets, outputs, save_drawing
 from epigauge.cli.bundle import (
     Backend,
@@ -35,7 +35,6 @@ from epigauge.cli.bundle import (
     Prune,
     Repeated,
     Start,
-    TracksFile,
     first_reconstruction,
 )
 from epigauge.io import TrackFile, load_track_file
@@ -44,7 +43,13 @@ from epigauge.multi_view.compare import Comparison
 
 
 def compare(
-    tracks: TracksFile,
+    tracks: Annotated[
+        Path,
+        typer.Argument(
+            help="NPZ, CSV (view, point, x, y), BAL (.txt, .bz2) or a COLMAP folder.",
+            show_default=False,
+        ),
+    ],
     methods: Annotated[
         str, typer.Option(help="all, or several of: " + ", ".join(STRATEGIES) + ".")
     ] = "all",
@@ -78,7 +83,7 @@ def compare(
     out = console()
     observed: TrackFile | SceneJob
     if refine is not None or is_scene(tracks):
-        refuse_options({"clean": clean or None, "start": start})
+        refuse_options({"clean": clean or None, "start": start} | of_tracks(init, prune, repeated))
         observed = SceneJob(tracks, refine, fix_view or [])
     else:
         observed = load_track_file(tracks, clean, prune=repeated if prune else None)

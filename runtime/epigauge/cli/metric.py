@@ -27,7 +27,7 @@ from epigauge.cli._common import (
 )
 from epigauge.cli._scenes import save_cloud
 from epigauge.cli._targets import Plot, Targets, check_folder, check_target, outputs
-from epigauge.cli.bundle import Backend, Clean, Prune, Repeated, TracksFile
+from epigauge.cli.bundle import Backend, Clean, Prune, Repeated
 from epigauge.io import load_track_file, plain, save_scene
 from epigauge.io._npz_scene import write_npz_scene
 from epigauge.multi_view.display import display
@@ -37,7 +37,12 @@ __all__ = ["camera_rows", "metric"]
 
 
 def metric(
-    tracks: TracksFile,
+    tracks: Annotated[
+        Path,
+        typer.Argument(
+            help="NPZ, CSV (view, point, x, y) or BAL (.txt, .bz2).", show_default=False
+        ),
+    ],
     image_size: Annotated[
         tuple[float, float],
         typer.Option(help="Width and height of the images in pixels.", metavar="W H"),
@@ -68,9 +73,9 @@ def metric(
     assumed. Gross errors in the tracks are set aside.
 
     Writes the focal lengths to stdout, one line of value and standard
-    deviation in pixels each; with --json everything known. Exit code 1 where the views do
-    not determine them, with a sentence why; then only what is asked for as JSON
-    is written.
+    deviation in pixels each; with --json everything known. Exit code 1 where
+    the views do not determine them, with a sentence why; then only what is
+    asked for as JSON is written.
     """
     targets = Targets(plot, output, json=json, check=_check_output)
     tracks = given(tracks)
