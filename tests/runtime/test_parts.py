@@ -124,6 +124,8 @@ def chunk(**other: Any) -> Any:
         ({"weights": [1.0, 0.0, 1.0, 1.0]}, "weights of chunk 1 are zero in row 1"),
         ({"view": [0.5, 1, 0, 1]}, "view of chunk 1 is float64"),
         ({"view": [], "point": [], "xy": np.zeros((0, 2))}, "view of chunk 1"),
+        ({"X": [["a", "b", "c"]] * 2}, "X of chunk 1 has type"),
+        ({"xy": np.full((4, 2), 1j)}, "xy of chunk 1 has type complex128"),
     ],
 )
 def test_chunks_that_do_not_fit_are_named(
@@ -150,6 +152,11 @@ def test_what_cannot_be_written_is_named(scene: Scene, written: Path, tmp_path: 
         write([], tmp_path, start)
     with pytest.raises(eg.ArgumentError, match="is a Reconstruction"):
         write(tracks, tmp_path, start.to_projective())
+    for source, told in ((None, "is a NoneType"), ([5], "gives int as chunk 0")):
+        with pytest.raises(eg.ArgumentError, match=f"source {told}"):
+            write(source, tmp_path / "none", start)
+    with pytest.raises(eg.ArgumentError, match="folder is a NoneType"):
+        write(tracks, None, start)  # type: ignore[arg-type]
     cameras = eg.Cameras("SIMPLE_PINHOLE", [[800.0, 0.0, 0.0]], [0] * 4)
     four = eg.MetricReconstruction([np.eye(3)] * 4, np.zeros((4, 3)), np.zeros((1, 3)), cameras)
     other = chunk(view=[2, 3, 2, 3])
@@ -211,6 +218,10 @@ def test_a_part_of_another_scene_is_named(folder: Path, scene: Scene, tmp_path: 
         (lambda told: told.update(names=["a"]), "1 names of 12 views"),
         (lambda told: told.update(scale_px=float("nan")), "not positive"),
         (lambda told: told.update(n_views=13), "cameras.npz: has 12 views"),
+        (lambda told: told.update(n_points=float("inf")), "is damaged: OverflowError"),
+        (lambda told: told["parts"][0].pop("bytes"), "is damaged: KeyError"),
+        (lambda told: told["parts"][0].update(n_points=10**15), r"10+ points, \d+ observations in"),
+        (lambda told: told["parts"][0].update(n_points=0, n_observations=0), "0 points"),
     ],
 )
 def test_a_changed_manifest_is_named(change: Any, message: str, folder: Path) -> None:
@@ -388,12 +399,15 @@ def test_what_parts_cannot_be_adjusted_with_is_named(
         ({"method": "free"}, "method is given with a folder of parts"),
         ({"partitions": 4}, "partitions is given with a folder of parts"),
         ({"memory_limit": -1}, "memory_limit"),
-        ({"output": written}, "holds something"),
+        ({"output": written}, "output .* holds something"),
         ({"loss": "l1"}, "loss"),
         ({"fixed_views": [40]}, "fixed_views"),
     ):
         with pytest.raises(eg.ArgumentError, match=message):
             adjust(written, client, **options)
+    with pytest.raises(eg.ArgumentError, match="refine"):
+        adjust(written, client, refine="x", output=tmp_path / "unwritten")
+    assert not (tmp_path / "unwritten").exists()
     tracks, start = metric()
     with pytest.raises(eg.ArgumentError, match="memory_limit is given with tracks"):
         adjust(tracks, client, start, memory_limit=5)

@@ -215,10 +215,10 @@ class Parts:
             found = json.loads(text)
             if not isinstance(found, dict) or found.get("form") != FORM:
                 raise FileFormatError(path, f"is no manifest: needed: form {FORM!r}")
-            made = _parts(folder, found)
+            made, sizes = _parts(folder, found)
         except FileFormatError:
             raise
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        except (ArithmeticError, LookupError, RecursionError, TypeError, ValueError) as error:
             raise FileFormatError(path, f"is damaged: {cut(repr(error), 100)}") from None
         counts = (
             ("n_points", made.n_points, sum(part.n_points for part in made.parts)),
@@ -227,8 +227,8 @@ class Parts:
         for name, said, count in counts:
             if said != count:
                 raise FileFormatError(path, f"{name} is {said}, its parts have {count}")
-        for part, size in zip(made.parts, found["parts"], strict=True):
-            _check_size(part, size["bytes"])
+        for part, size in zip(made.parts, sizes, strict=True):
+            _check_size(part, size)
         return made
 
     def start(self) -> tuple[MetricReconstruction, list[Indices]]:
@@ -277,16 +277,20 @@ def is_parts(path: PathLike) -> bool:
     return folder.is_dir() and ((folder / MANIFEST).exists() or any(folder.glob("part-[0-9]*.npz")))
 
 
-def _parts(folder: Path, found: dict[str, Any]) -> Parts:
+def _parts(folder: Path, found: dict[str, Any]) -> tuple[Parts, list[int]]:
+    """Return what a manifest says, and how many bytes each part has."""
     scene, whitened = bytes.fromhex(found["scene"]).hex(), bool(found["whitened"])
     n, m, N = (int(found[name]) for name in _NUMBERS)
-    parts = []
+    parts, sizes = [], []
     for row in found["parts"]:
         name = str(row["file"])
         if Path(name).name != name:
             raise ValueError(f"file {name!r} is not in the folder")
-        counts = int(row["n_points"]), int(row["n_observations"])
-        parts.append(Part(str(folder / name), scene, n, *counts, whitened))
+        size, points, seen = (int(row[key]) for key in ("bytes", "n_points", "n_observations"))
+        if not 0 < points <= seen <= size:  # no more is allocated than there can be
+            raise ValueError(f"{points} points, {seen} observations in {size} bytes of {name!r}")
+        sizes.append(size)
+        parts.append(Part(str(folder / name), scene, n, points, seen, whitened))
     unit, heaviest, scale = (float(found[name]) for name in ("unit", "heaviest", "scale_px"))
     if not parts or min(n, m, N) < 1 or not all(0.0 < x < np.inf for x in (unit, heaviest, scale)):
         raise ValueError("numbers that are not positive")
@@ -295,13 +299,14 @@ def _parts(folder: Path, found: dict[str, Any]) -> Parts:
         names = tuple(map(str, names))
         if len(names) != n:
             raise ValueError(f"{len(names)} names of {n} views")
-    return Parts(folder, tuple(parts), scene, n, m, N, unit, heaviest, scale, whitened, names)
+    numbers = n, m, N, unit, heaviest, scale
+    return Parts(folder, tuple(parts), scene, *numbers, whitened, names), sizes
 
 
-def _check_size(part: Part, size: object) -> None:
+def _check_size(part: Part, size: int) -> None:
     try:
         found = Path(part.path).stat().st_size
     except OSError as error:
         raise part.fault(f"cannot be read: {error.strerror or error}") from None
     if found != size:
-        raise part.fault(f"has {found} bytes, the manifest says {cut(size)}: it was cut or changed")
+        raise part.fault(f"has {found} bytes, the manifest says {size}: it was cut or changed")

@@ -164,10 +164,6 @@ def adjust_parts(
     as_choice("loss", loss, LOSSES)
     stopping = lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter)
     parts, table = Parts.open(folder), kernels.table(backend)
-    writer = None
-    if output is not None:
-        unit, whitened = parts.unit, parts.whitened
-        writer = PartsWriter.new(output, parts.n_views, unit, whitened, parts.names)
     begun, numbers = parts.start()
     begun = begun if start is None else start
     fixed_views = listed("fixed_views", fixed_views)
@@ -197,6 +193,10 @@ def adjust_parts(
         )
         tail = PartsTail(asked, begun.vectors, begun.X, weighted=False)
         scale_px = EFFICIENT[loss] * max(scale_of_median(tail.median, tail.count), 1e-12)
+    writer = None
+    if output is not None:  # which is begun when all else is known to be right
+        common = parts.unit, parts.whitened, parts.names
+        writer = PartsWriter.new(output, parts.n_views, *common, name="output")
     outcome, cameras, points = minimized(
         job,
         graph,

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epigauge._arguments import MAX_PX, as_array, as_count, as_weights
+from epigauge._arguments import MAX_PX, as_array, as_count, as_real, as_weights
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.cameras import MetricReconstruction
 from epigauge.distributed.observations import Observations
@@ -130,6 +130,9 @@ def write_parts(
         unit, whitened = source.unit, source.whitening is not None
         arrays: Iterator[PartArrays] = _of_tracks(source, start, partitions)
     else:
+        if not isinstance(source, Iterable):
+            was = f"is a {type(source).__name__}"
+            raise ArgumentError("source", was, "eg.Tracks(...), or chunks")
         if partitions is not None:
             raise ArgumentError("partitions", "is given with chunks", "one chunk for each part")
         named, unit, whitened = names, 1.0, False
@@ -182,14 +185,17 @@ class PartsWriter:
         unit: float,
         whitened: bool,
         names: Sequence[str] | None,
+        name: str = "folder",
     ) -> PartsWriter:
-        """Begin a folder, which must be new or empty."""
+        """Begin a folder, which must be new or empty; `name` is what errors call it."""
+        if not isinstance(folder, str | os.PathLike):
+            raise ArgumentError(name, f"is a {type(folder).__name__}", "the name of a folder")
         folder = Path(folder)
         if not folder.absolute().parent.is_dir():
             parent = str(folder.parent)
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), parent)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise ArgumentError("folder", f"{str(folder)!r} holds something", "a new one")
+            raise ArgumentError(name, f"{str(folder)!r} holds something", "a new one")
         folder.mkdir(exist_ok=True)
         known = None if names is None else view_names(names, n_views)
         return cls(folder, n_views, unit, whitened, known)
@@ -303,7 +309,11 @@ def _of_chunks(chunks: Iterable[Chunk], n_views: int) -> Iterator[PartArrays]:
     """Give the parts of chunks, their points numbered as they come."""
     begin = k = 0
     for k, chunk in enumerate(chunks, 1):
-        part = _checked(f"chunk {k - 1}", Chunk(*chunk), n_views, begin)
+        fields: tuple[Any, ...] = tuple(chunk) if isinstance(chunk, tuple | list) else ()
+        if len(fields) not in (len(Chunk._fields) - 1, len(Chunk._fields)):
+            was = f"gives {type(chunk).__name__} as chunk {k - 1}"
+            raise ArgumentError("source", was, "eg.distributed.Chunk(X, view, point, xy)")
+        part = _checked(f"chunk {k - 1}", Chunk(*fields), n_views, begin)
         begin += len(part.X)
         yield part
     if not k:
@@ -311,14 +321,14 @@ def _of_chunks(chunks: Iterable[Chunk], n_views: int) -> Iterator[PartArrays]:
 
 
 def _checked(where: str, chunk: Chunk, n_views: int, begin: int) -> PartArrays:
-    X = np.asarray(as_array(f"X of {where}", chunk.X, "an (m, 3) array"), np.float64)
+    X = as_real(f"X of {where}", chunk.X, "an (m, 3) array")
     if X.ndim != 2 or X.shape[1] != 3 or not len(X) or not np.isfinite(X).all():
         raise ArgumentError(f"X of {where}", f"has shape {X.shape}", "finite numbers, (m, 3)")
     views, points = (
         _indices(f"{name} of {where}", value, limit)
         for name, value, limit in (("view", chunk.view, n_views), ("point", chunk.point, len(X)))
     )
-    xy = np.asarray(as_array(f"xy of {where}", chunk.xy, "an (N, 2) array"), np.float64)
+    xy = as_real(f"xy of {where}", chunk.xy, "an (N, 2) array")
     N = len(views)
     if xy.shape != (N, 2) or len(points) != N:
         was = f"has shape {xy.shape} beside {N} views and {len(points)} points"
