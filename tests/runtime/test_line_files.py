@@ -66,7 +66,7 @@ def test_views_have_the_names_of_the_tracks(tmp_path: Path, scene: eg.LineScene)
     named = eg.Tracks(tracks.view, tracks.point, tracks.xy, names=names)
     path = tmp_path / "lines.csv"
     eg.save_line_tracks(path, scene.line_tracks, named)
-    assert '"5.jpg"' in path.read_text()
+    assert "\n5.jpg,0," in path.read_text()
     assert same(eg.load_line_tracks(path, named), scene.line_tracks)
     with pytest.raises(eg.FileFormatError, match=r"line 2: view is '5.jpg', needed: numbers"):
         eg.load_line_tracks(path)
@@ -204,3 +204,53 @@ def test_a_cloud_without_edges_is_as_before(tmp_path: Path) -> None:
     head, _, body = (tmp_path / "cloud.ply").read_bytes().partition(b"end_header\n")
     assert b"edge" not in head
     assert len(body) == 2 * 15
+
+
+def test_names_that_a_table_would_not_give_back_are_refused(
+    tmp_path: Path, scene: eg.LineScene
+) -> None:
+    lines, tracks = scene.line_tracks, scene.tracks
+    few = lines.line < 2
+    parts = lines.view[few], lines.line[few], lines.segments[few]
+    # The second were read as lines 1 and 0.
+    for names in (["a\nb", "c"], ["1", "0"], ["nan", "edge"]):
+        named = eg.LineTracks(*parts, names=names)
+        with pytest.raises(eg.ArgumentError, match=r"lines (hold|begin with) '"):
+            eg.save_line_tracks(tmp_path / "named.csv", named)
+        eg.save_line_tracks(tmp_path / "named.npz", named)
+        assert eg.load_line_tracks(tmp_path / "named.npz").names == tuple(names)
+    for numbers in (["7", "8", "9", "10", "110"], ["0", "2", "30", "31", "99"]):  # rising
+        views = eg.Tracks(tracks.view, tracks.point, tracks.xy, names=numbers)
+        eg.save_tracks(tmp_path / "numbers.csv", views)
+        assert eg.load_tracks(tmp_path / "numbers.csv").names == tuple(numbers)
+    for numbers in (["01", "02", "03", "04", "05"], ["1", "2", "3", "4", "99999999999"]):
+        views = eg.Tracks(tracks.view, tracks.point, tracks.xy, names=numbers)
+        with pytest.raises(eg.ArgumentError, match="which is read as a number"):
+            eg.save_tracks(tmp_path / "numbers.csv", views)
+    views = eg.Tracks(tracks.view, tracks.point, tracks.xy, names=list("10234"))
+    with pytest.raises(eg.ArgumentError, match="tracks begin with '1', which is read as a number"):
+        eg.save_line_tracks(tmp_path / "named.csv", lines, views)
+    with pytest.raises(eg.ArgumentError, match="names begin with '1', which is read as a number"):
+        eg.save_tracks(tmp_path / "named.csv", views)
+    assert not (tmp_path / "named.csv").exists()
+
+
+def test_what_is_given_for_tracks_is_checked(tmp_path: Path, scene: eg.LineScene) -> None:
+    eg.save_line_tracks(tmp_path / "lines.csv", scene.line_tracks)
+    wrong: Any = 5
+    with pytest.raises(eg.ArgumentError, match="tracks is a int"):
+        eg.load_line_tracks(tmp_path / "lines.csv", wrong)
+    with pytest.raises(eg.ArgumentError, match="tracks is a int"):
+        eg.save_line_tracks(tmp_path / "lines.csv", scene.line_tracks, wrong)
+
+
+@pytest.mark.parametrize("sigma", [1e200, 1e-200])
+def test_deviations_whose_squares_are_none_are_refused(sigma: float, scene: eg.LineScene) -> None:
+    lines, tracks = scene.line_tracks, scene.tracks
+    with pytest.raises(eg.ArgumentError, match="sigma is"):
+        eg.LineTracks(lines.view, lines.line, lines.segments, sigma=sigma)
+    with pytest.raises(eg.ArgumentError, match="sigma is"):
+        eg.Tracks(tracks.view, tracks.point, tracks.xy, sigma=sigma)
+    covariance = np.full((len(lines), 1, 1, 1), sigma**1.5) * np.tile(np.eye(2), (2, 1, 1))
+    with pytest.raises(eg.ArgumentError, match=r"covariance is no covariance"):
+        eg.LineTracks(lines.view, lines.line, lines.segments, covariance=covariance)

@@ -101,7 +101,7 @@ def read_text(
         if first:
             separator = _separator(text)
         fields = _split(text, separator)
-        header = first and not any(map(_is_number, fields))
+        header = first and not any(map(is_number, fields))
         if header:
             names = _names(path, fields, columns, line)
         names = names or columns.names
@@ -116,7 +116,7 @@ def read_text(
         if len(values) >= MAX_MATCHES * len(wanted):
             raise FileFormatError(path, f"holds more than {MAX_MATCHES} {columns.what}", line)
         if not values:
-            codes = {n: {} for n in columns.labels if not _is_number(fields[wanted[n]])}
+            codes = {n: {} for n in columns.labels if not is_number(fields[wanted[n]])}
         for name, known in codes.items():
             field = fields[wanted[name]]
             fields[wanted[name]] = known.setdefault(field, str(len(known)))
@@ -226,7 +226,8 @@ def _column_count(found: int, names: Sequence[str], columns: Columns) -> str:
     return f"{count}, needed: {len(names)} ({listed(names)})"
 
 
-def _is_number(field: str) -> bool:
+def is_number(field: str) -> bool:
+    """Tell whether a field, without its quotes, stands for a number, though one with a comma."""
     try:
         float(field.replace(",", "."))
     except ValueError:
@@ -253,7 +254,7 @@ def _coordinate(path: Path, field: str, line: int) -> float:
             raise ValueError
         value = float(field)
     except ValueError:
-        hint = " (write a decimal point, not a comma)" if _is_number(field) else ""
+        hint = " (write a decimal point, not a comma)" if is_number(field) else ""
         raise FileFormatError(path, f"{cut(field)!r} is not a number{hint}", line) from None
     if not math.isfinite(value):
         raise FileFormatError(path, f"{cut(field)!r} is not finite", line)

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import bz2
 import gzip
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
+from itertools import pairwise
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.errors import ArgumentError
+from epigauge.io._common import MAX_MATCHES
+from epigauge.io._text import is_number
 from epigauge.multi_view.tracks import Tracks
 
 Array = NDArray[np.float64]
@@ -40,7 +44,11 @@ def write_csv(file: IO[bytes], tracks: Tracks) -> None:
         was = "have coordinates measured unlike, or together, for which CSV has no place"
         raise ArgumentError("tracks", was, "a name ending in .npz")
     arrays = arrays_of(tracks)
-    names = None if tracks.names is None else np.array(list(map(_label, tracks.names)))
+    names = None
+    if tracks.names is not None and _are_numbers(tracks.names):
+        names = np.array(tracks.names)
+    elif tracks.names is not None:
+        names = np.array(labels("names", tracks.names, int(tracks.view[0])))
     views = tracks.view if names is None else names[tracks.view]
     head = ["view", "point", "x", "y", *(["weight"] if "weights" in arrays else [])]
     columns = [views, tracks.point, *tracks.xy.T]
@@ -50,10 +58,34 @@ def write_csv(file: IO[bytes], tracks: Tracks) -> None:
         file.write((",".join(map(_written, row)) + "\n").encode())
 
 
-def _label(name: str) -> str:
-    """Return the name of a view as a field, quoted where it has to be."""
+def labels(argument: str, names: Sequence[str], first: int) -> list[str]:
+    """Return names as fields of a table whose first row has one of them.
+
+    Raises
+    ------
+    ArgumentError
+        If they would not be read as they are: the first row says whether a column has names.
+    """
+    if is_number(names[first]):
+        was = f"begin with {names[first]!r:.60}, which is read as a number"
+        raise ArgumentError(argument, was, "other names for CSV, or NPZ")
+    return [_label(argument, name) for name in names]
+
+
+def _are_numbers(names: Sequence[str]) -> bool:
+    """Tell whether names are rising whole numbers, which readers take for numbers of views."""
+    longest = len(str(MAX_MATCHES)) - 1
+    if not all(name.isdecimal() and len(name) <= longest for name in names):
+        return False
+    numbers = [int(name) for name in names]
+    rising = all(first < second for first, second in pairwise(numbers))
+    return rising and [*map(str, numbers)] == [*names]
+
+
+def _label(argument: str, name: str) -> str:
+    """Return a name as a field, quoted where it has to be."""
     if not name.isprintable():
-        raise ArgumentError("names", f"hold {name!r:.60}", "names of one line for CSV, or NPZ")
+        raise ArgumentError(argument, f"hold {name!r:.60}", "names of one line for CSV, or NPZ")
     special = name != name.strip() or any(mark in name for mark in ",;#\"'")
     return '"' + name.replace('"', '""') + '"' if special else name
 

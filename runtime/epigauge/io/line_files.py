@@ -14,6 +14,7 @@ from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._common import PathLike, check_suffix
 from epigauge.io._npz import read_npz, write_npz
 from epigauge.io._text import Columns, read_text
+from epigauge.io._track_writing import labels
 from epigauge.io.output import writing
 from epigauge.multi_view.line_tracks import LineTracks
 from epigauge.multi_view.tracks import Tracks
@@ -74,6 +75,7 @@ def load_line_tracks(path: PathLike, tracks: Tracks | None = None) -> LineTracks
     """
     path = Path(path)
     form = check_suffix(path, ".csv", ".npz")
+    _check_tracks(tracks)
     with path.open("rb") as file:
         if form == ".npz":
             return _of_arrays(path, file)
@@ -112,7 +114,8 @@ def save_line_tracks(path: PathLike, lines: LineTracks, tracks: Tracks | None = 
     Raises
     ------
     ArgumentError
-        On another suffix, and for CSV on covariances that are not one number a segment.
+        On another suffix, and for CSV on covariances that are not one number a segment, and names
+        that would be read as numbers or have more than one line.
     OSError
         If the file cannot be written.
 
@@ -123,6 +126,7 @@ def save_line_tracks(path: PathLike, lines: LineTracks, tracks: Tracks | None = 
     form = check_suffix(path, ".csv", ".npz")
     if not isinstance(lines, LineTracks):
         raise ArgumentError("lines", f"is a {type(lines).__name__}", "eg.LineTracks(...)")
+    _check_tracks(tracks)
     if form == ".npz":
         with writing(path) as file:
             write_npz(file, arrays_of_lines(lines))
@@ -137,8 +141,8 @@ def save_line_tracks(path: PathLike, lines: LineTracks, tracks: Tracks | None = 
         was = f"have {len(view_names)} views, and lines name view {lines.view.max()}"
         raise ArgumentError("tracks", was, "those of the same views")
     columns: list[Sequence[Any]] = [
-        [_quoted(view_names[k]) if view_names else k for k in lines.view.tolist()],
-        [_quoted(lines.names[k]) if lines.names else k for k in lines.line.tolist()],
+        _fields("tracks", view_names, lines.view.tolist()),
+        _fields("lines", lines.names, lines.line.tolist()),
         *lines.segments.T.tolist(),
         sigma.tolist(),
     ]
@@ -146,6 +150,11 @@ def save_line_tracks(path: PathLike, lines: LineTracks, tracks: Tracks | None = 
     table += [",".join(map(_written, row)) for row in zip(*columns, strict=True)]
     with writing(path) as file:
         file.write(("\n".join(table) + "\n").encode())
+
+
+def _check_tracks(tracks: object) -> None:
+    if not (tracks is None or isinstance(tracks, Tracks)):
+        raise ArgumentError("tracks", f"is a {type(tracks).__name__}", "eg.Tracks(...), or none")
 
 
 def arrays_of_lines(lines: LineTracks) -> dict[str, Any]:
@@ -158,9 +167,12 @@ def _written(value: object) -> str:
     return f"{value:.17g}" if isinstance(value, float) else str(value)
 
 
-def _quoted(name: str) -> str:
-    """Return a name as a field that is no number and holds its commas."""
-    return '"' + name.replace('"', '""') + '"'
+def _fields(argument: str, names: Sequence[str] | None, numbers: list[int]) -> Sequence[Any]:
+    """Return a column of names, or of numbers where there are none."""
+    if names is None:
+        return numbers
+    found = labels(argument, names, numbers[0])
+    return [found[k] for k in numbers]
 
 
 def _of_arrays(path: Path, file: IO[bytes]) -> LineTracks:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epigauge._arguments import MAX_PX, as_array, as_count, as_real
+from epigauge._arguments import MAX_PX, MIN_PX, as_array, as_count, as_real
 from epigauge._results import Result
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.labels import view_names
@@ -188,9 +188,10 @@ def _spread(sigma: ArrayLike | None, covariance: ArrayLike | None, count: int) -
         if array.shape not in ((), (count,)):
             raise ArgumentError("sigma", f"has shape {array.shape}", f"({count},)")
         both = np.broadcast_to(array, (count,))
-        bad = np.flatnonzero(~((both > 0.0) & np.isfinite(both)))
+        bad = np.flatnonzero(~((both >= MIN_PX) & (both <= MAX_PX)))
         if len(bad):
-            raise ArgumentError("sigma", f"is {both[bad[0]]} in row {bad[0]}", "positive numbers")
+            needed = f"positive numbers, {MIN_PX:g} to {MAX_PX:g}"
+            raise ArgumentError("sigma", f"is {both[bad[0]]} in row {bad[0]}", needed)
         return np.asarray(both[:, None] ** 2 * np.array([1.0, 0.0, 1.0, 1.0, 0.0, 1.0]))
     if sigma is not None:
         raise ArgumentError("covariance", "is given beside sigma", "one of them")
@@ -199,7 +200,8 @@ def _spread(sigma: ArrayLike | None, covariance: ArrayLike | None, count: int) -
         raise ArgumentError("covariance", f"has shape {S.shape}", f"({count}, 2, 2, 2)")
     even = np.abs(S - np.swapaxes(S, 2, 3)).max(axis=(1, 2, 3)) <= 1e-9 * np.abs(S).max((1, 2, 3))
     positive = np.isfinite(S).all(axis=(1, 2, 3)) & even
-    positive[positive] = np.linalg.eigvalsh(S[positive]).min(axis=(1, 2)) > 0.0
+    values = np.linalg.eigvalsh(S[positive])
+    positive[positive] = (values >= MIN_PX**2).all((1, 2)) & (values <= MAX_PX**2).all((1, 2))
     if not positive.all():
         was = f"is no covariance in row {int(np.argmin(positive))}"
         raise ArgumentError("covariance", was, "symmetric, positive definite matrices")

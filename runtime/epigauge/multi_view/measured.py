@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epigauge._arguments import as_real
+from epigauge._arguments import MAX_PX, MIN_PX, as_real
 from epigauge.errors import ArgumentError
 
 __all__ = ["measured", "merged_sums"]
@@ -44,9 +44,10 @@ def measured(
     if array.shape not in ((), (count,), (count, 2)):
         raise ArgumentError("sigma", f"has shape {array.shape}", f"({count},) or ({count}, 2)")
     both = np.broadcast_to(array if array.ndim == 2 else array.reshape(-1, 1), (count, 2))
-    bad = np.flatnonzero(~((both > 0.0) & np.isfinite(both)).all(axis=1))
+    bad = np.flatnonzero(~((both >= MIN_PX) & (both <= MAX_PX)).all(axis=1))
     if len(bad):
-        raise ArgumentError("sigma", f"is {both[bad[0]]} in row {bad[0]}", "positive numbers")
+        needed = f"positive numbers, {MIN_PX:g} to {MAX_PX:g}"
+        raise ArgumentError("sigma", f"is {both[bad[0]]} in row {bad[0]}", needed)
     unit = float(np.median(both))
     mean = np.sqrt(both[:, 0] * both[:, 1])
     if (both[:, 0] == both[:, 1]).all():
