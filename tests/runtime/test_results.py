@@ -263,3 +263,11 @@ def test_public_methods_are_described_with_an_example() -> None:
     for method in vars(Result).values():
         if isinstance(method, types.FunctionType) and not method.__name__.startswith("_"):
             assert "Examples\n" in (method.__doc__ or "")
+
+
+def test_a_picture_of_matches_that_do_not_agree_says_so() -> None:
+    pytest.importorskip("matplotlib", reason="pictures need Matplotlib")
+    x1, x2 = np.random.default_rng(0).uniform(0.0, 500.0, (2, 60, 2))
+    lengths = eg.estimate_two_view(x1, x2).plot(x1, x2).axes[1]
+    assert [text.get_text() for text in lengths.texts] == ["none"]
+    assert not lengths.patches

@@ -134,7 +134,7 @@ def _(result: HomographyResult, x1: ArrayLike, x2: ArrayLike) -> Figure:
 
 @plot_result.register(TwoViewResult)
 def _(result: TwoViewResult, x1: ArrayLike, x2: ArrayLike) -> Figure:
-    """Draw the picture of the fit of the model, or where the points went."""
+    """Draw where the points went: those that agree with the model, and the others."""
     a, b = as_matches(x1, x2, at_least=1)
     title = f"Model of two views: {result.model}"
     marks = _marks(result.inliers, a)
@@ -249,7 +249,11 @@ def _moves(
         values, name = np.linalg.norm(x2 - x1, axis=1)[good], "distance moved (px)"
     else:
         values, name = error[good & np.isfinite(error)], "distance from where H leads (px)"
-    lengths.hist(values, bins=40, color=BLUE, alpha=0.55, ec="white", lw=0.5)
+    if len(values):
+        lengths.hist(values, bins=40, color=BLUE, alpha=0.55, ec="white", lw=0.5)
+    else:
+        lengths.set(xticks=[], yticks=[])
+        lengths.text(0.5, 0.5, "none", color=GREY, ha="center", transform=lengths.transAxes)
     lengths.set(xlabel=name, ylabel="matches")
     finish(lengths, "Lengths of those that agree", legend=False)
     return figure
@@ -274,7 +278,8 @@ def _deviations(result: Any) -> dict[str, Array]:
     if isinstance(result, ReconstructionCovariance):
         return {"entries of the cameras": _roots(result.cameras)}
     own = result.std if isinstance(result, AffineCovariance) else result
-    return {name: np.ravel(value) for name, value in own._contents().items() if np.size(value)}
+    known = own._contents().items()
+    return {k: np.ravel(value) for k, value in known if value is not None and np.size(value)}
 
 
 def _roots(blocks: Array) -> Array:
