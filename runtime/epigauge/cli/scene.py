@@ -78,7 +78,12 @@ def scene(
     ] = False,
     workers: Annotated[int, typer.Option(help="Threads that verify pairs and adjust.")] = 1,
     cache: Annotated[
-        Path | None, typer.Option(help="NPZ file for features and matches, to begin there again.")
+        Path | None,
+        typer.Option(
+            help="NPZ file for features and matches; where it exists they are taken from it, as "
+            "they are.",
+            show_default=False,
+        ),
     ] = None,
 ) -> int:
     """Reconstruct a scene from photographs, knowing nothing of the cameras.
