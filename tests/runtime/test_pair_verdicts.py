@@ -76,6 +76,20 @@ class TestPlanes:
                     told[name] += bool(flags & {"planar scene", "nearly planar"})
         assert planes == 22
         assert min(told.values()) >= 20, told
+        files = sorted((data_dir / "pairs").glob("*.npz"))
+        assert len(files) == 24
+        nearly = []
+        for file in files:
+            with np.load(file) as pair:
+                x1, x2, right = pair["x1"], pair["x2"], pair["inlier"].astype(bool)
+            for solve in (eg.refine_fundamental, eg.estimate_fundamental):
+                assert not {"planar scene", "nearly planar"} & set(
+                    solve(x1[right], x2[right]).flags
+                )
+            raw = eg.estimate_fundamental(x1, x2)
+            assert "planar scene" not in raw.flags
+            nearly += [file.stem] if "nearly planar" in raw.flags and raw.success else []
+        assert nearly in ([], ["kusvod2_corr"])
 
     @pytest.mark.slow
     def test_a_photograph_and_its_own_warp_are_a_plane(self, data_dir) -> None:
