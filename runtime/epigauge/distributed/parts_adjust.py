@@ -57,6 +57,11 @@ class PartsResult(Result):
         As there.
     output : str or None
         The folder that the result was written to.
+
+    Examples
+    --------
+    >>> found = eg.distributed.bundle_adjust("parts", client, output="found")  # doctest: +SKIP
+    >>> print(found.success, found.flags, found.rms_px)  # doctest: +SKIP
     """
 
     reconstruction: MetricReconstruction = field(repr=False)

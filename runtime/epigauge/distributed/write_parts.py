@@ -49,6 +49,13 @@ class Chunk(NamedTuple):
         Pixels.
     weights : array_like, shape (N,), optional
         Factor of each squared residual.
+
+    Examples
+    --------
+    >>> import epigauge as eg
+    >>> chunk = eg.distributed.Chunk([[0.0, 0.0, 4.0]], [0, 1], [0, 0], [[0.0, 0.0], [90.0, 0.0]])
+    >>> len(chunk.view)
+    2
     """
 
     X: ArrayLike
