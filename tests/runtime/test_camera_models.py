@@ -98,7 +98,8 @@ def test_what_a_correction_folds_away_has_no_image(backend):
     np.testing.assert_allclose(corrected, -1000.0 * X[:3, :2] / X[:3, 2:], rtol=1e-6)
 
 
-def test_a_measurement_beyond_the_fold_is_a_gross_error():
+@pytest.mark.parametrize("covariance", [None, [[1.0, 0.3], [0.3, 1.0]]])
+def test_a_measurement_beyond_the_fold_is_a_gross_error(covariance):
     rng = np.random.default_rng(1)
     n, m = 4, 30
     X = np.column_stack([rng.uniform(-1.0, 1.0, (m, 2)), rng.uniform(-7.0, -5.0, m)])
@@ -109,7 +110,7 @@ def test_a_measurement_beyond_the_fold_is_a_gross_error():
     xy = scene.project(eg.Tracks(view, point, np.zeros((n * m, 2))))
     xy += 0.3 * rng.standard_normal(xy.shape)
     xy[17] = 2500.0, 400.0
-    tracks = eg.Tracks(view, point, xy)
+    tracks = eg.Tracks(view, point, xy, covariance=covariance)
     bent = eg.bundle_adjust(tracks, scene, refine="pose")
     assert "gross errors" in bent.flags
     assert not bent.success
@@ -118,3 +119,8 @@ def test_a_measurement_beyond_the_fold_is_a_gross_error():
     assert found.success
     assert found.rms_px < 0.4
     np.testing.assert_array_equal(np.flatnonzero(found.rejected), [17])
+    begin = X.copy()
+    begin[3, 0] += 6.0  # where it has no image
+    away = eg.MetricReconstruction(scene.R, t, begin, cameras)
+    assert np.isinf(away.project(tracks)).any()
+    assert eg.bundle_adjust(tracks, away, refine="pose", robust=True).rms_px < 0.4

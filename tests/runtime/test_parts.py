@@ -233,6 +233,11 @@ def test_a_changed_manifest_is_named(change: Any, message: str, folder: Path) ->
         read(folder)
 
 
+def test_a_folder_of_parts_is_no_scene_to_load(written: Path) -> None:
+    with pytest.raises(eg.ArgumentError, match=r"a folder of parts; needed: eg\.distributed"):
+        eg.load_scene(written)
+
+
 def test_a_folder_that_was_not_finished_is_told(folder: Path) -> None:
     (folder / "parts.json").unlink()
     with pytest.raises(FileFormatError, match=r"parts.json.* parts are written, then this"):

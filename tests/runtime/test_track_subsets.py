@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import epigauge as eg
 import numpy as np
 import pytest
@@ -64,3 +66,9 @@ def test_what_is_too_little_is_refused(tracks: Tracks, keep: object, message: st
 
 def test_a_calibrated_camera_needs_fewer_points(tracks: Tracks) -> None:
     assert tracks.subset(tracks.point < 5, min_points=1)[0].n_points == 5
+
+
+def test_the_least_number_of_points_is_a_number(tracks: Tracks) -> None:
+    wrong: Any = "three"
+    with pytest.raises(eg.ArgumentError, match="min_points is 'three'"):
+        tracks.subset(tracks.point < 12, min_points=wrong)

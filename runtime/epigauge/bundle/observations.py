@@ -105,4 +105,8 @@ def whitened(whitening: Array | None, values: Array) -> Array:
     if whitening is None:
         return values
     W = whitening if values.ndim == 2 else whitening[:, :, None]
-    return np.asarray(np.stack([np.sum(row * values, axis=0) for row in W]))
+    with np.errstate(invalid="ignore"):
+        found = np.stack([np.sum(row * values, axis=0) for row in W])
+    if values.ndim == 2:  # what is infinitely far stays so, with parts of both signs
+        found[:, np.isinf(values).any(axis=0)] = np.inf
+    return np.asarray(found)

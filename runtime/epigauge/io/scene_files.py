@@ -92,6 +92,9 @@ def load_scene(
     path = Path(path)
     as_choice("repeated", repeated, _REPEATED)
     as_choice("weak", weak, _WEAK)
+    if (path / "parts.json").exists():
+        was = f"is {str(path)!r}, a folder of parts"
+        raise ArgumentError("path", was, "eg.distributed.bundle_adjust, which reads them in parts")
     if path.is_dir():
         raw = raw_scene(path, read_folder(path))
     elif path.suffix.lower() == ".npz":

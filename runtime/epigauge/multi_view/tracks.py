@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epigauge._arguments import MAX_PX, MIN_PX, as_array, as_choice, as_double, as_weights
+from epigauge._arguments import MAX_PX, MIN_PX, as_array, as_choice, as_count, as_double, as_weights
 from epigauge._results import Result
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.labels import image_sizes, point_colours, view_names
@@ -138,7 +138,7 @@ class Tracks(Result):
         self.whitening: Array | None = None if whitening is None else whitening[:, :, self.order]
         self.source = source
         self.n_repeated = int(self._again().sum())
-        self._check(repeated, min_points)
+        self._check(repeated, as_count("min_points", min_points, at_least=0))
         for array in (self.order, self.view, self.point, self.xy, self.weights):
             array.setflags(write=False)
         self.names = None if names is None else view_names(names, self.n_views)
