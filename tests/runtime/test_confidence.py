@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import epigauge as eg
 import numpy as np
@@ -96,11 +97,27 @@ def test_what_is_saved_and_a_batch_say_the_same(tmp_path: Path) -> None:
         eg.load_result(tmp_path / "refined.npz").probability_good(1.0)
 
 
-@pytest.mark.parametrize("px", [0.0, -1.0, np.nan, np.inf, "1"])
-def test_a_bound_that_is_none_is_refused(px: float) -> None:
+@pytest.mark.parametrize("px", [0.0, -1.0, np.nan, np.inf, "1", [1.0], [1.0, 2.0], []])
+def test_a_bound_that_is_none_is_refused(px: Any) -> None:
     result = eg.estimate_fundamental(*matches(40, 0.0, 0.5, 9)[:2])
     with pytest.raises(eg.ArgumentError, match="px"):
         result.probability_good(px)
+
+
+def test_bounds_of_a_batch_are_one_or_one_a_pair() -> None:
+    x1, x2, *_ = matches(40, 0.0, 0.5, 9)
+    batch = eg.estimate_fundamental_batch(np.vstack([x1, x1]), np.vstack([x2, x2]), [0, 40, 80])
+    own = batch.probability_good(np.array([0.5, 1.0]))
+    assert own.tolist() == [batch.probability_good(0.5)[0], batch.probability_good(1.0)[1]]
+    with pytest.raises(eg.ArgumentError, match="px"):
+        batch.probability_good(np.array([0.5, 1.0, 2.0]))
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_smallest_and_largest_bounds_are_bounds() -> None:
+    result = eg.estimate_fundamental(*matches(40, 0.0, 0.5, 9)[:2])
+    assert result.probability_good(5e-324) == 0.0
+    assert result.probability_good(1e308) == 1.0
 
 
 def test_what_is_not_determined_promises_little() -> None:

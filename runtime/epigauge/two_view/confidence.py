@@ -113,15 +113,17 @@ def probability_below(
     Raises
     ------
     ArgumentError
-        If `px` is not above 0.
+        If `px` is not above 0, or neither one number nor one for each probability.
     """
-    bound = as_real("px", px, "a distance in pixels")
+    bound, p_wrong = as_real("px", px, "a distance in pixels"), np.asarray(p_wrong)
     if not np.all((bound > 0.0) & np.isfinite(bound)):
         raise ArgumentError("px", "is not finite and above 0", "a distance in pixels")
-    p_wrong = np.asarray(p_wrong)
+    if bound.shape not in ((), p_wrong.shape):
+        raise ArgumentError("px", f"has shape {bound.shape}", "one distance in pixels")
     with np.errstate(over="ignore"):
         right = 1.0 / (1.0 + (np.asarray(error_px) / bound) ** (1.0 / width))
-    return np.asarray((1.0 - p_wrong) * right + p_wrong / (1.0 + _ELSEWHERE_PX / bound))
+        elsewhere = 1.0 / (1.0 + _ELSEWHERE_PX / bound)
+    return np.asarray((1.0 - p_wrong) * right + p_wrong * elsewhere)
 
 
 def error_text(error_px: float, p_wrong: float) -> str:

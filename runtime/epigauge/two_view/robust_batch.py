@@ -74,13 +74,13 @@ class RobustBatch(FundamentalBatch):
     error_px: Array
     p_wrong: Array
 
-    def probability_good(self, px: float) -> Array:
+    def probability_good(self, px: ArrayLike) -> Array:
         """Return the probability of each pair that its median error is below so many pixels.
 
         Parameters
         ----------
-        px : float
-            Bound, in pixels.
+        px : float or array_like, shape (n,)
+            Bound, in pixels; or one for each pair.
 
         Returns
         -------
