@@ -65,6 +65,9 @@ _AT_BORDER, _BORDER, _TOGETHER_PX = 0.7, 0.1, 4.0
 #: by more than so many pixels.
 _BENT, _BENT_PX = 1.0, 0.5
 
+#: Flags that say that the inliers determine neither F nor a homography.
+_NOTHING = frozenset({"no common geometry", "undetermined"})
+
 #: Ratio of the two singular values of E below which it has rank one.
 _RANK_ONE = 16.0 * np.finfo(float).eps
 
@@ -318,7 +321,7 @@ def _verified(
     flags, inlier, noise = result.flags, result.inlier, result.rms_px * _per_coordinate(result)
     note = ", ".join(flags)
     count = int(np.count_nonzero(inlier))
-    if "no common geometry" in flags or count < min_inliers:
+    if not _NOTHING.isdisjoint(flags) or count < min_inliers:
         return told(_DEGENERATE, note=note or f"{count} inliers")
     if pair.bend_px > max(_BENT * noise, _BENT_PX):
         return told(-1, note=", ".join(filter(None, (note, "distorted cameras"))))

@@ -113,6 +113,21 @@ def the_same(one: eg.colmap.DatabaseVerification, other: eg.colmap.DatabaseVerif
     assert one.note == other.note
 
 
+@pytest.mark.parametrize("prior", [0, 1])
+def test_points_of_one_line_have_no_geometry(tmp_path: Path, prior: int) -> None:
+    rng = np.random.default_rng(5)
+    x1 = np.column_stack([rng.uniform(0.0, W, 150), np.full(150, 300.0)])
+    x2 = x1 @ [[0.9, 0.2], [-0.2, 0.9]] + [60.0, 20.0]
+    pairs = []
+    for noise in (0.0, 0.5):
+        pair = [x + noise * rng.standard_normal(x.shape) for x in (x1, x2)]
+        for x in pair:
+            x[:40] = rng.uniform([0.0, 0.0], [W, H], (40, 2))
+        pairs.append((pair[0], pair[1]))
+    path = database(tmp_path / "lines.db", pairs, prior=prior)
+    assert eg.colmap.verify_database(path).config.tolist() == [1, 1]
+
+
 @pytest.mark.parametrize(
     ("prior", "expected"), [(1, [2, 4, 5, 7, 1]), (0, [3, 6, 6, 7, 1])], ids=["known f", "guessed"]
 )

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.two_view.chance import SIGNIFICANT
+from epigauge.two_view.collinear import is_left_open
 from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.essential import Calibrated
 from epigauge.two_view.evidence import ROUNDING, Evidence
@@ -92,6 +93,8 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     - gross errors: the geometry of highest likelihood under a mixture of right and wrong matches is
       no chance, leaves some far off, and the variance of those near it is less than half of s^2;
       with a robust loss, where s is more than a quarter per cent of the range of the coordinates;
+    - undetermined: the inliers are on one line of both images within the noise, but for a few that
+      no geometry through that line needs, or that agree by chance with one;
     - planar scene: ``S_H / (2 n - 8) <= max(1.5, F99) s^2``, with F99 the 99 % quantile of the
       ratio of two such variances. The bound 1.5 is that of the geometric AIC [1]_ for many matches,
       ``S_H + 2 (2 n + 8) s^2 <= S + 2 (3 n + p) s^2``; with few matches an F fits a plane better
@@ -146,6 +149,7 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     if (judged.searched or wide or few) and not is_common(judged, 0.0 if few else SIGNIFICANT):
         raised["no common geometry"] = True
     else:
+        raised["undetermined"] = is_left_open(judged)
         for name, is_raised in _plane(judged).items():
             raised[name] = is_raised or raised.get(name, False)
     return ordered(name for name, is_raised in raised.items() if is_raised)

@@ -25,6 +25,7 @@ from epigauge._options import Loss as LossName
 from epigauge.errors import ArgumentError
 from epigauge.linear import Levenberg
 from epigauge.two_view.chance import SIGNIFICANT, chance_on_plane, log10_false_alarms
+from epigauge.two_view.collinear import is_plane_left_open
 from epigauge.two_view.conditioning import Conditioning, condition
 from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.copies import counted_once
@@ -361,6 +362,7 @@ def _flags(
         if alarms > (SIGNIFICANT if wide else 0.0):
             told["no common geometry"] = True
             return ordered(name for name, raised in told.items() if raised)
+    told["undetermined"] = is_plane_left_open(problem.kernels, state.H, q1, q2, near)
     moved = q2 - q1 - (to2[:2, 2] - to1[:2, 2])[:, None]
     more = float(weights @ np.sum(moved**2, axis=0)) / 2.0 - float(np.sum(squared))
     told["still camera"] = more <= still_bound(n, 2 * n - PARAMETERS) * noise2

@@ -20,6 +20,7 @@ from epigauge._logged import logged
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 from epigauge.two_view.chance import CEILING, SIGNIFICANT, chance_on_plane, log10_false_alarms
+from epigauge.two_view.collinear import is_plane_left_open
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.copies import earliest
@@ -211,7 +212,8 @@ def estimate_homography(
     agreed = int(np.count_nonzero(plane_squares(table, H, q1, q2)[used] <= bound**2))
     chance = chance_on_plane(table, H, q1, q2, bound)
     alarms = log10_false_alarms(len(rows), agreed, chance, LEAST)
-    flags = ("no common geometry",) * bool(alarms > SIGNIFICANT) + ("undetermined",) * is_open
+    is_left_open = is_open or is_plane_left_open(table, H, q1, q2, used, bound)
+    flags = ("no common geometry",) * bool(alarms > SIGNIFICANT) + ("undetermined",) * is_left_open
     if threshold is None and options.get("noise_px") is None and np.isfinite(result.noise_px):
         tails = 1.0 / math.sqrt(_KEPT)  # the threshold has cut them off
         result = replace(

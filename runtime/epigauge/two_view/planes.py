@@ -38,6 +38,7 @@ __all__ = [
     "may_be_rotation",
     "rotation_within",
     "share_on_a_plane",
+    "threes",
 ]
 
 Array = NDArray[np.float64]
@@ -148,7 +149,7 @@ def on_a_plane(found: Evidence) -> tuple[NDArray[np.intp], Mask]:
         kappa, gain = found.table.plane_parallax(found.F, U[:, 2].copy(), found.q1, found.q2)
         q = np.vstack([found.q1, np.ones(n)])[:, ::step]
         kappa, gain = kappa[::step], gain[::step]
-        a, b, c = _threes(q.shape[1]).T
+        a, b, c = threes(q.shape[1]).T
         ab, ac = q[:2, b] - q[:2, a], q[:2, c] - q[:2, a]
         bk, ck = kappa[b] - kappa[a], kappa[c] - kappa[a]
         area = ab[0] * ac[1] - ab[1] * ac[0]
@@ -175,7 +176,7 @@ def _on(v: Array, q: Array, kappa: Array, gain: Array, bound: float) -> Mask:
     return np.asarray(~(np.abs(gain * (kappa - v.T @ q)) > np.sqrt(2.0) * bound))
 
 
-def _threes(n: int) -> NDArray[np.intp]:
+def threes(n: int) -> NDArray[np.intp]:
     """Return threes of n matches, by the generator that the C library has, too."""
     state, threes = 1, []
     for _ in range(3 * SAMPLES):

@@ -22,6 +22,7 @@ from epigauge._library import address, library
 from epigauge._native import check_sizes
 from epigauge.two_view import native
 from epigauge.two_view.chance import CEILING, PAIRS, RANK, SIGNIFICANT, log10_false_alarms
+from epigauge.two_view.collinear import may_be_lines
 from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.diagnostics import AFFINE, PIXELS, REDUNDANCY, WEAK, planar_bound
 from epigauge.two_view.evidence import WITHIN
@@ -146,11 +147,13 @@ def verdicts_of(
         One entry a pair; flags are None where these tests do not suffice.
     """
     found: list[tuple[tuple[str, ...] | None, bool]] = []
-    rows = _facts(pair, x1, x2, offsets, weights, pair.distances, _OPTIONS)
-    for row, scale, own in zip(
-        rows, pair.table[:, 35].tolist(), pair.numbers.tolist(), strict=True
+    rows = [Facts(*row) for row in _facts(pair, x1, x2, offsets, weights, pair.distances, _OPTIONS)]
+    noise_px = pair.table[:, 35] * [_noise(own) for own in rows]
+    on_lines = may_be_lines(x1, x2, offsets, noise_px).tolist()
+    for row, scale, own, doubtful in zip(
+        rows, pair.table[:, 35].tolist(), pair.numbers.tolist(), on_lines, strict=True
     ):
-        raised = None if own[0] else flags(Facts(*row), scale)
+        raised = None if own[0] or doubtful else flags(row, scale)
         success = raised is not None and own[4] > 0 and verdicts.usable(raised, "F")
         found.append((raised, success))
     return found
@@ -196,6 +199,9 @@ def verdict_of_raw(
     if limit_px > CEILING * RANGE * scale:
         return None, False
     if own.squares > (own.number - _FREE) * (HIDDEN * RANGE) ** 2:
+        return None, False
+    y1, y2 = x1[agreed > 0.0], x2[agreed > 0.0]
+    if may_be_lines(y1, y2, np.array([0, len(y1)]), np.array([scale * _noise(own)]))[0]:
         return None, False
     plain = _plain_flags(own, scale)
     if plain is None or own.on_plane >= MOST_ON or own.places < PLENTY:
@@ -254,9 +260,8 @@ def flags(own: Facts, scale: float) -> tuple[str, ...] | None:
     found = _plain_flags(own, scale)
     if found is None or own.tail > TAIL_SHARE * (1.0 - _CLOSE) * own.squares:
         return None
-    n = int(own.number)
-    noise2 = own.squares / (n - _FREE)
-    noise = math.sqrt(noise2)
+    n, noise = int(own.number), _noise(own)
+    noise2 = noise**2
     if noise > WIDE * RANGE and not _is_plainly_common(own):
         return None
     if noise > HIDDEN * RANGE:
@@ -268,6 +273,11 @@ def flags(own: Facts, scale: float) -> tuple[str, ...] | None:
     elif own.on_plane >= MOST_ON:
         return None
     return found
+
+
+def _noise(own: Facts) -> float:
+    """Return the standard deviation of a coordinate."""
+    return math.sqrt(max(own.squares, 0.0) / max(own.number - _FREE, 1.0))
 
 
 def _plain_flags(own: Facts, scale: float) -> tuple[str, ...] | None:
