@@ -210,8 +210,12 @@ class SavedResult(dict[str, Any], Result):
     def probability_good(self, px: float) -> Any:
         """Return what the result of a robust estimate has under this name."""
         from epigauge.two_view.confidence import probability_below
+        from epigauge.two_view.tensors import REFUSED
 
-        found = probability_below(px, *(getattr(self, name) for name in ("error_px", "p_wrong")))
+        error, p_wrong = (np.asarray(getattr(self, key), float) for key in ("error_px", "p_wrong"))
+        error = np.where(np.isnan(error), np.inf, error)  # JSON has no infinity
+        good = probability_below(px, error, p_wrong)
+        found = np.where(np.asarray(self.status) == REFUSED, 0.0, good)
         return found if found.ndim else float(found)
 
     def __str__(self) -> str:

@@ -97,6 +97,23 @@ def test_what_is_saved_and_a_batch_say_the_same(tmp_path: Path) -> None:
         eg.load_result(tmp_path / "refined.npz").probability_good(1.0)
 
 
+@pytest.mark.parametrize("suffix", ["npz", "json"])
+def test_what_is_saved_of_an_open_geometry_promises_as_much(tmp_path: Path, suffix: str) -> None:
+    t = np.random.default_rng(12).uniform(0.0, 1000.0, (205, 1))
+    x1 = np.vstack([t[:200] * [1.0, 0.5], np.reshape(t[:10], (5, 2))])
+    x2 = np.vstack([1.1 * t[:200] * [1.0, 0.5] + 20.0, np.reshape(t[10:20], (5, 2))])
+    for result in (
+        eg.estimate_fundamental(x1, x2),  # on a line: the error is infinite
+        eg.estimate_fundamental_batch(
+            np.vstack([x1, x1[:3]]), np.vstack([x2, x2[:3]]), [0, 205, 208]
+        ),
+    ):
+        assert np.isinf(result.error_px).any()
+        result.save(tmp_path / f"open.{suffix}")
+        again = eg.load_result(tmp_path / f"open.{suffix}")
+        np.testing.assert_array_equal(again.probability_good(1.0), result.probability_good(1.0))
+
+
 @pytest.mark.parametrize("px", [0.0, -1.0, np.nan, np.inf, "1", [1.0], [1.0, 2.0], []])
 def test_a_bound_that_is_none_is_refused(px: Any) -> None:
     result = eg.estimate_fundamental(*matches(40, 0.0, 0.5, 9)[:2])
