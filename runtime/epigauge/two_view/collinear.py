@@ -110,6 +110,8 @@ def may_be_lines(x1: Array, x2: Array, offsets: NDArray[np.intp], noise_px: Arra
         Those that `is_left_open` has to judge.
     """
     counts, end = np.diff(offsets), offsets[1:]
+    if len(x1) < 3:
+        return np.zeros(len(counts), np.bool_)
     z = np.stack([x1, x2]).view(np.complex128)[..., 0]
     a, b = z[:, 1:-1] - z[:, :-2], z[:, 2:] - z[:, :-2]
     area = np.abs((a * b.conj()).imag)
