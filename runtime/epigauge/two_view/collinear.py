@@ -41,6 +41,9 @@ _PLANE = 2
 
 _REFITS = 3
 
+#: A weight below this is none: the noise of a match is that of weight one over its root.
+_LIGHT = 1e-100
+
 #: Points next to one another in the list are on a line by so many times the noise; so many of such
 #: threes are where most points are on one, and seldom elsewhere.
 _NEAR, _THREES = 3.0, 0.25
@@ -51,7 +54,8 @@ def is_left_open(found: Evidence) -> bool:
 
     Where the caller says that all are right, whether the others are no more than F needs.
     """
-    judged = [_off_line(q, found.noise) for q in (found.q1, found.q2)]
+    noise = found.noise / math.sqrt(max(float(np.median(found.weights)), _LIGHT))
+    judged = [_off_line(q, noise) for q in (found.q1, found.q2)]
     lines = [off for off in judged if off is not None]
     off, needed = np.any(lines, axis=0), 2 if found.from_rays is not None else 1
     if len(lines) < needed or np.mean(off) > 1.0 - MOST_ON:
@@ -92,7 +96,13 @@ def is_plane_left_open(
     return log10_false_alarms(b1.shape[1], count, chance, _PLANE) > SIGNIFICANT
 
 
-def may_be_lines(x1: Array, x2: Array, offsets: NDArray[np.intp], noise_px: Array) -> Mask:
+def may_be_lines(
+    x1: Array,
+    x2: Array,
+    offsets: NDArray[np.intp],
+    noise_px: Array,
+    weights: Array | None = None,
+) -> Mask:
     """Tell by a cheap test of which pairs of images most points may be on one line.
 
     Parameters
@@ -102,7 +112,9 @@ def may_be_lines(x1: Array, x2: Array, offsets: NDArray[np.intp], noise_px: Arra
     offsets : ndarray, shape (n + 1,)
         Pair k has the matches ``offsets[k]:offsets[k + 1]``.
     noise_px : ndarray, shape (n,)
-        Standard deviation of a coordinate.
+        Standard deviation of a coordinate of weight one.
+    weights : ndarray, shape (m,), optional
+        Factor of each squared residual, 1 by default.
 
     Returns
     -------
@@ -116,7 +128,11 @@ def may_be_lines(x1: Array, x2: Array, offsets: NDArray[np.intp], noise_px: Arra
     a, b = z[:, 1:-1] - z[:, :-2], z[:, 2:] - z[:, :-2]
     area = np.abs((a * b.conj()).imag)
     up_to = np.zeros((2, z.shape[1] + 1), np.intp)
-    bound = np.repeat(_NEAR * noise_px, counts)[:-2]
+    bound = np.repeat(_NEAR * noise_px, counts)
+    if weights is not None:
+        # Matches of weight zero are on no line.
+        bound = np.where(weights > 0.0, bound / np.sqrt(np.maximum(weights, _LIGHT)), 0.0)
+    bound = bound[:-2]
     near = np.zeros(z.shape, np.bool_)
     near[:, :-2] = area <= bound * np.maximum(np.abs(a), np.abs(b))
     near[:, :-2] &= (a != 0.0) & (b != 0.0) & (a != b)  # three points

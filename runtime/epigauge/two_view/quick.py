@@ -149,7 +149,7 @@ def verdicts_of(
     found: list[tuple[tuple[str, ...] | None, bool]] = []
     rows = [Facts(*row) for row in _facts(pair, x1, x2, offsets, weights, pair.distances, _OPTIONS)]
     noise_px = pair.table[:, 35] * [_noise(own) for own in rows]
-    on_lines = may_be_lines(x1, x2, offsets, noise_px).tolist()
+    on_lines = may_be_lines(x1, x2, offsets, noise_px, weights).tolist()
     for row, scale, own, doubtful in zip(
         rows, pair.table[:, 35].tolist(), pair.numbers.tolist(), on_lines, strict=True
     ):
