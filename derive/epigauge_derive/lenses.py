@@ -23,6 +23,12 @@ def polynomial(x: sp.Expr, coefficients: Sequence[sp.Expr]) -> sp.Expr:
     return 1 + value
 
 
+def balanced(squared: sp.Expr, A: Sequence[sp.Expr], R0: sp.Expr) -> sp.Expr:
+    """Return A1 (r^2 - R0^2) + A2 (r^4 - R0^4) + ...: a radial distortion that is none at R0."""
+    zero = R0**2
+    return sum(a * (squared**n - zero**n) for n, a in enumerate(A, start=1))
+
+
 def tangential(u: sp.Expr, v: sp.Expr, p1: sp.Expr, p2: sp.Expr) -> tuple[sp.Expr, sp.Expr]:
     """Return the shift of a point by a lens off its axis (Brown): to p2 along u, p1 along v."""
     squared = u**2 + v**2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sympy as sp
 
 from epigauge_derive.camera_model import CameraModel, Vector
-from epigauge_derive.lenses import direction, tangential
+from epigauge_derive.lenses import balanced, direction, tangential
 
 
 def image(h: sp.Matrix, k: Vector) -> list[sp.Expr]:
@@ -13,13 +13,11 @@ def image(h: sp.Matrix, k: Vector) -> list[sp.Expr]:
     c, x0, y0, A1, A2, A3, B1, B2, C1, C2, R0 = k
     u, v = direction(h)
     x, y = -c * u, -c * v
-    squared, zero = x**2 + y**2, R0**2
-    # Balanced: no distortion at the radius R0.
-    balanced = sum(A * (squared**n - zero**n) for n, A in ((1, A1), (2, A2), (3, A3)))
+    radial = balanced(x**2 + y**2, (A1, A2, A3), R0)
     shift = tangential(x, y, B2, B1)
     return [
-        x0 + x * (1 + balanced) + shift[0] + C1 * x + C2 * y,
-        y0 + y * (1 + balanced) + shift[1],
+        x0 + x * (1 + radial) + shift[0] + C1 * x + C2 * y,
+        y0 + y * (1 + radial) + shift[1],
     ]
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import sympy as sp
 
 from epigauge_derive.camera_model import CameraModel, Vector
-from epigauge_derive.lenses import direction, tangential
+from epigauge_derive.lenses import balanced, direction, tangential
 from epigauge_derive.models.cameras.brown import MODEL as BROWN
 
 
@@ -23,10 +23,9 @@ def correct(q: Vector, k: Vector) -> Sequence[sp.Expr]:
     _, x0, y0, *lens, R0 = k
     A, (B1, B2, C1, C2) = lens[:3], lens[3:]
     x, y = q[0] - x0, q[1] - y0
-    squared, zero = x**2 + y**2, R0**2
-    balanced = sum(A[n - 1] * (squared**n - zero**n) for n in (1, 2, 3))
+    radial = balanced(x**2 + y**2, A, R0)
     shift = tangential(x, y, B2, B1)
-    return [q[0] + x * balanced + shift[0] + C1 * x + C2 * y, q[1] + y * balanced + shift[1]]
+    return [q[0] + x * radial + shift[0] + C1 * x + C2 * y, q[1] + y * radial + shift[1]]
 
 
 MODEL = CameraModel(
