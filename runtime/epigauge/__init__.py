@@ -52,7 +52,8 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge.kernels import backend, set_backend
     from epigauge.line_scenes import LineScene, line_scene
     from epigauge.metric.pair import FocalLengths, focal_lengths
-    from epigauge.metric.upgrade import MetricUpgrade, metric_upgrade
+    from epigauge.metric.result import MetricUpgrade
+    from epigauge.metric.upgrade import metric_upgrade
     from epigauge.multi_view import gauge
     from epigauge.multi_view.adjust import BundleResult, bundle_adjust
     from epigauge.multi_view.affine_start import initialize_affine
@@ -193,7 +194,8 @@ _WHERE = {
     "kernels": "backend set_backend",
     "line_scenes": "LineScene line_scene",
     "metric.pair": "FocalLengths focal_lengths",
-    "metric.upgrade": "MetricUpgrade metric_upgrade",
+    "metric.result": "MetricUpgrade",
+    "metric.upgrade": "metric_upgrade",
     "multi_view.adjust": "BundleResult bundle_adjust",
     "multi_view.affine_start": "initialize_affine",
     "multi_view.compare": "Comparison compare",

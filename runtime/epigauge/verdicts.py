@@ -94,6 +94,13 @@ FLAGS = {
         "determined less well than by any other motion",
         "trust the standard deviations, or look past the point in some images",
     ),
+    "critical motion": Flag(
+        "the views turn about one axis or look at one point, and a focal length is uncertain by "
+        "more than a twentieth, or hangs on the distortion by as much: the shape of the scene with "
+        "it",
+        "take images with the camera tilted and looking past the object, or give the focal length",
+        ("views",),
+    ),
     "weak focal length": Flag(
         "the standard deviation of a focal length exceeds a twentieth of it",
         "add views that are turned against the others, or give the focal length",

@@ -47,3 +47,13 @@ def test_the_scene_leads_to_the_known_optimum_of_fixed_cameras(data_dir: Path) -
     assert bundle.rms_px < 0.7353
     assert near.sum() > 66000
     assert found.rms_px < 0.4
+
+
+@pytest.mark.parametrize("name", ["house", "corridor"])
+def test_a_focal_length_that_hangs_on_the_lens_is_no_success(name: str, data_dir: Path) -> None:
+    # One axis of rotation: without distortion the same tracks fit another camera as well.
+    tracks, size, K = _load(data_dir / name)
+    found = eg.metric_upgrade(tracks, image_size=size)
+    assert not found.success
+    assert {"one rotation axis", "critical motion"} <= set(found.flags)
+    assert abs(found.focal_px - 0.5 * (K[0, 0] + K[1, 1])) < 2.0 * found.focal_std_px

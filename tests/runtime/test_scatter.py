@@ -100,7 +100,7 @@ def test_noise_alone_decides_what_is_undetermined(monkeypatch: pytest.MonkeyPatc
     # A lens far from its model widens the deviation, and the flag says it is weak; nothing is open.
     tracks, _ = tracks_of(seed=0, noise_px=0.3, n_views=8)
     monkeypatch.setattr(
-        "epigauge.metric.upgrade.known_to", lambda known, unit: (np.array([400.0]), 300.0, True)
+        "epigauge.metric.verdict.known_to", lambda known, unit: (np.array([400.0]), 300.0, True)
     )
     found = eg.metric_upgrade(tracks, image_size=SIZE)
     assert found.focal_std_px >= 400.0

@@ -15,7 +15,7 @@ from epigauge.multi_view.uncertainty import covariance
 from epigauge.uncertainty.covariance import MetricCovariance
 from epigauge.uncertainty.scatter import scatter_of
 
-__all__ = ["beside_the_model", "focal_lengths_of", "known_to", "turn_std"]
+__all__ = ["beside_the_bend", "beside_the_model", "focal_lengths_of", "known_to", "turn_std"]
 
 Array = NDArray[np.float64]
 
@@ -124,6 +124,47 @@ def beside_the_model(
         return none
     shift = focal_lengths_of(rich) - focal_lengths_of(poor)
     by_noise = np.maximum(_focal(sure)[1] - _focal(known)[1], 0.0)
+    return np.asarray(np.sqrt(np.maximum(shift**2 - by_noise, 0.0)))
+
+
+def beside_the_bend(tracks: Tracks, known: MetricCovariance, backend: str | None) -> Array:
+    """Return how far a lens without distortion moves each focal length, beyond what noise would.
+
+    Of most motions a little: the distortion shows in the images themselves. Where views turn about
+    one axis, or look at one point, one number trades for the other, and what the distortion is
+    wrong by, as any model of a real lens is, is in the focal length many times over.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        What was adjusted, with its weights.
+    known : MetricCovariance
+        Of the adjustment.
+    backend : str or None
+        Where the formulas are computed.
+
+    Returns
+    -------
+    ndarray, shape (c,)
+        In pixels; infinite where principal points are open without distortion, too.
+    """
+    bent = known.reconstruction
+    model = camera_model(bent.cameras.model)
+    straight = tuple(name for name in model.adjusted if name[0] in "fc")
+    params = np.where(np.isin(model.params, straight), bent.cameras.params, 0.0)
+    cameras = Cameras(model.name, params, bent.cameras.camera_of_view)
+    start = MetricReconstruction(bent.R, bent.t, bent.X, cameras)
+    try:
+        options: Any = {"refine": straight, "backend": backend}
+        # To the end: the valley is long.
+        found = bundle_adjust(tracks, start, max_iter=100, **options)
+        plain = found.reconstruction
+        assert isinstance(plain, MetricReconstruction)
+        sure = covariance(tracks, plain, noise_px=known.noise_px, **options)
+    except ArgumentError:
+        return np.full(len(cameras), np.inf)
+    shift = focal_lengths_of(plain) - focal_lengths_of(bent)
+    by_noise = np.maximum(_focal(known)[1], _focal(sure)[1])
     return np.asarray(np.sqrt(np.maximum(shift**2 - by_noise, 0.0)))
 
 

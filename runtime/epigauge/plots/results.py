@@ -15,7 +15,7 @@ from epigauge.cameras import AffineReconstruction, MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.io import Matches
 from epigauge.metric.pair import FocalLengths
-from epigauge.metric.upgrade import MetricUpgrade
+from epigauge.metric.result import MetricUpgrade
 from epigauge.multi_view.display import display
 from epigauge.multi_view.line_tracks import LineTracks
 from epigauge.multi_view.reconstruction import Reconstruction
