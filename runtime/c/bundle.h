@@ -100,7 +100,7 @@ EG_EXPORT int eg_bundle_schur(
     const double *points, const double *T, const double *half, const eg_envelope *envelope,
     double *pairs, double *reduced);
 
-int eg_bundle_eliminate(
+EG_EXPORT int eg_bundle_eliminate(
     const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras,
     const double *points, double lam, int damping, const eg_envelope *envelope, double *V, double *D,
     double *g, double *T, double *half, double *camera_sums, double *pairs, double *reduced);

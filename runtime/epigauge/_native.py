@@ -150,6 +150,7 @@ _TYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "bundle_refine_points": (_I, (*_RANGE, *[_P] * 5)),
     "bundle_inverse_roots": (_I, (_N, _N, _P, _P, _N, _D, _P, _P, _P)),
     "bundle_schur": (_I, (*_RANGE, *[_P] * 7)),
+    "bundle_eliminate": (_I, (*_RANGE, _P, _P, _D, _I, *[_P] * 9)),
     "bundle_couple": (_I, (*_RANGE, *[_P] * 3, _N, *[_P] * 4)),
     "bundle_marginals": (_I, (*_RANGE, *[_P] * 8)),
     "bundle_point_steps": (_D, (_N, _N, *[_P] * 4, _N, _P)),

@@ -281,7 +281,8 @@ def minimize(
     """Minimise a cost by damped steps.
 
     A problem may have a method `compiled` that runs the same loop in C; it returns None where that
-    does not know all parts.
+    does not know all parts. One that can linearise and make a step in one pass may have a method
+    `expect`, which is told the next lambda before `linearize`, 0 where no step follows.
 
     Parameters
     ----------
@@ -326,6 +327,7 @@ def minimize(
         if done is not None:
             found: Outcome[S] = done
             return found
+    expect = getattr(problem, "expect", None)
     begun = time.perf_counter()
     state = problem.evaluate(start)
     history: list[Row] = []
@@ -390,11 +392,16 @@ def minimize(
         predicted = system.predicted(step)
         lam = max(schedule.accepted(lam, decrease / predicted if predicted > 0.0 else 1.0), least)
         state = trial
+        ended = 0
+        if stop:
+            ended = -2
+        elif decrease <= stopping.ftol * state.cost:
+            ended = 2
+        elif norm <= stopping.xtol:
+            ended = 3
+        if expect is not None:
+            expect(0.0 if ended or iteration >= stopping.max_iter else lam)
         system = problem.linearize(state)
         njev += 1
-        if stop:
-            return outcome(-2)
-        if decrease <= stopping.ftol * state.cost:
-            return outcome(2)
-        if norm <= stopping.xtol:
-            return outcome(3)
+        if ended:
+            return outcome(ended)

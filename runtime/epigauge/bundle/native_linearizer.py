@@ -118,7 +118,7 @@ class NativeLinearizer:
         camera_sums, self.pair_sums = ctypes.c_ssize_t(), Blocks()
         widths = map(ctypes.addressof, (camera_sums, self.pair_sums))
         function("bundle_widths")(self.reference, *widths)
-        self._camera_sums = camera_sums.value
+        self.camera_sums = camera_sums.value
         self._passes, self._pairs = self.layout.shares(workers)
         # The calling thread has the first share.
         others = max(len(self._passes), len(self._pairs)) - 1
@@ -211,12 +211,27 @@ class NativeLinearizer:
     def linearize(self, cameras: Array, points: Array) -> Normal:
         """Return the normal equations."""
         skyline = self.skyline  # the order of the cameras is settled from here on
-        n, (m, b), d = skyline.n, points.shape, self.width
-        estimate = self._estimate(cameras, points)
-        V, g = np.empty((m, b, b)), np.empty((m, b))
-        depths = np.empty((m, b, b)) if self.factored else None
+        estimate, (V, depths, g) = self._estimate(cameras, points), self.room(points)
         before = tuple(map(address, (*estimate, V, depths, g)))
-        (sums,) = self._summed("bundle_linearize", before, (n, self._camera_sums))
+        (sums,) = self._summed("bundle_linearize", before, (skyline.n, self.camera_sums))
+        return self.gathered(estimate, sums, V, depths, g)
+
+    def room(self, points: Array) -> tuple[Array, Array | None, Array]:
+        """Return room for the blocks of points, their depths and gradients."""
+        m, b = points.shape
+        depths = np.empty((m, b, b)) if self.factored else None
+        return np.empty((m, b, b)), depths, np.empty((m, b))
+
+    def gathered(
+        self,
+        estimate: tuple[Array, Array],
+        sums: Array,
+        V: Array,
+        depths: Array | None,
+        g: Array,
+    ) -> Normal:
+        """Return normal equations from sums of cameras and the blocks of points."""
+        n, d = self.skyline.n, self.width
         U, g_cameras = np.empty((n, d, d)), np.empty((n, d))
         of_cameras = np.empty((n, d, d)) if self.factored else None
         arrays = map(address, (sums, U, of_cameras, g_cameras))

@@ -143,7 +143,7 @@ class Evaluation:
         self, cameras: Array, points: Array, T: Array, half: Array | None
     ) -> tuple[Terms, None]:
         """Return the blocks of W T T^T W^T, and W T half."""
-        return self.eliminated(self._coupling(cameras, points), T, half), None
+        return self.eliminated(*self._coupling(cameras, points).schur(T, half)), None
 
     def diagonal(self, cameras: Array, points: Array, T: Array) -> tuple[Terms, None]:
         """Return the diagonal blocks of W T T^T W^T."""
@@ -155,9 +155,8 @@ class Evaluation:
             return NativeCoupling(own, cameras[self.views], np.ascontiguousarray(points))
         return own.linearize(cameras[self.views], points).coupling
 
-    def eliminated(self, coupling: Any, T: Array, half: Array | None) -> Terms:
-        """Return the blocks of W T T^T W^T, and W T half."""
-        pairs, right = coupling.schur(T, half)
+    def eliminated(self, pairs: Any, right: Array) -> Terms:
+        """Return the blocks of W T T^T W^T, and W T half, as sums."""
         slots, (rows, columns) = self._slots
         if isinstance(self.linearizer, NativeLinearizer):
             blocks = pairs.blocks

@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from epigauge.bundle.dampings import lifted
 from epigauge.bundle.linearizer import Normal, PointRefinement, point_damping
+from epigauge.bundle.native_linearizer import NativeLinearizer
 from epigauge.bundle.problem import in_range
 from epigauge.bundle.ties import congruent
 from epigauge.cameras import camera_model
 from epigauge.distributed.evaluation import Evaluation
+from epigauge.distributed.fused import Elimination, eliminate, fits
 from epigauge.distributed.observations import Observations, Setup, Source
-from epigauge.distributed.sums import Terms
+from epigauge.distributed.sums import Rows, Terms
 
 __all__ = ["Partition"]
 
@@ -87,16 +89,30 @@ class Partition:
         """Take the points of a state from outside."""
         self.states[token] = _State(cameras, points)
 
-    def linearize_state(self, token: int) -> tuple[Terms, Arrays]:
-        """Linearise at a state; return the sums of cameras, what is largest, and the points."""
-        state, normal = self.states[token], self._normal(token)
-        own = {"points": state.points, "largest": 0.0, "steepest": 0.0}
+    def linearize_state(self, token: int, lam: float, direct: bool) -> tuple[Terms, Arrays]:
+        """Linearise at a state; return the sums of cameras, what is largest, and the points.
+
+        With lam > 0 the sums go on with those of `eliminate`, made in the same pass; where that is
+        singular, with nothing.
+        """
+        state, singular = self.states[token], False
+        more: Terms = ()
+        if lam > 0.0:
+            try:
+                more, _ = self.eliminate(token, lam, direct)
+            except np.linalg.LinAlgError:
+                singular = True
+        normal = self._normal(token)
+        own = {"points": state.points, "largest": 0.0, "steepest": 0.0, "singular": singular}
         if len(normal.V):
             traces = np.einsum("mii->m", normal.V) / normal.V.shape[1]
             own["largest"] = float(traces.max())
             own["steepest"] = float(np.abs(normal.g_points).max())
         self.states = {token: state}
-        return self.evaluation.sums(normal), own
+        sums = self.evaluation.sums(normal)
+        if singular:
+            more = tuple(Rows(rows.index[:0], rows.values[:0]) for rows in sums[:2])
+        return (*sums, *more), own
 
     def blocks_of_state(self, token: int) -> tuple[Terms, Arrays]:
         """Return the blocks of points at a state."""
@@ -104,17 +120,22 @@ class Partition:
 
     def eliminate(self, token: int, lam: float, direct: bool) -> tuple[Terms, None]:
         """Return what eliminating damped points leaves: blocks of pairs or of views, and W T h."""
-        coupling, (T, half, _) = self._normal(token).coupling, self._roots(token, lam)
+        own = self.evaluation
+        made = self._damped(token, lam, direct)
+        if made.pairs is not None and made.right is not None:
+            return own.eliminated(made.pairs, made.right), None
+        coupling = made.normal.coupling
         if direct:
-            return self.evaluation.eliminated(coupling, T, half), None
-        right = coupling.to_cameras(T, half)
-        return (self.evaluation.rows(coupling.diagonal(T)), self.evaluation.rows(right)), None
+            return own.eliminated(*coupling.schur(made.T, made.half)), None
+        right = coupling.to_cameras(made.T, made.half)
+        return (own.rows(coupling.diagonal(made.T)), own.rows(right)), None
 
     def product(self, token: int, lam: float, x: Array) -> tuple[Terms, None]:
         """Return W T T^T W^T x."""
-        coupling, (T, _, _) = self._normal(token).coupling, self._roots(token, lam)
-        own = np.ascontiguousarray(x[self.evaluation.views])
-        return (self.evaluation.rows(coupling.to_cameras(T, coupling.to_points(T, own))),), None
+        made, local = self._damped(token, lam), np.ascontiguousarray(x[self.evaluation.views])
+        coupling, T = made.normal.coupling, made.T
+        moved = coupling.to_cameras(T, coupling.to_points(T, local))
+        return (self.evaluation.rows(moved),), None
 
     def advance(
         self,
@@ -132,10 +153,8 @@ class Partition:
         tuple
             Sums: cost, doubled; g . y, y . D y and y . y for the step y of the points.
         """
-        state, normal = self.states[token], self._normal(token)
-        T, half, D = self._roots(token, lam)
-        step = np.ascontiguousarray(own[self.evaluation.views])
-        y = -np.einsum("mij,mj->mi", T, half + normal.coupling.to_points(T, step))
+        state, made = self.states[token], self._damped(token, lam)
+        y, energy = made.point_steps(np.ascontiguousarray(own[self.evaluation.views]))
         points, local = state.points + y, cameras[self.evaluation.views]
         if self.model.homogeneous:
             points = in_range(points)
@@ -148,8 +167,7 @@ class Partition:
                     refined = np.where(self._kept[:, None], points, refined)
                     costs = self.evaluation.linearizer.point_costs(local, refined)
                 points = refined
-            energy = float(np.einsum("mi,mij,mj->", y, D, y))
-            sums = float(costs.sum()), float(np.vdot(normal.g_points, y)), energy
+            sums = float(costs.sum()), float(np.vdot(made.normal.g_points, y)), energy
         self.states = {token: state, reached: _State(cameras, points)}
         return (*sums, float(np.vdot(y, y))), None
 
@@ -160,23 +178,39 @@ class Partition:
             state.normal = own.linearizer.linearize(state.cameras[own.views], state.points)
         return state.normal
 
-    def _roots(self, token: int, lam: float) -> tuple[Array, Array, Array]:
-        """Return T, T^T g and the damping D of the points; T of fixed ones is zero."""
-        state, normal = self.states[token], self._normal(token)
-        if state.damped is None or state.damped[0] != lam:
-            V, g = normal.V, normal.g_points
-            depth = None if normal.depth_blocks is None else normal.depth_blocks[1]
-            C = self._free(V)
-            V, depth = congruent(C, V), None if depth is None else congruent(C, depth)
-            D = point_damping(self.model, V, depth)
-            if not (self.model.metric or self.model.homogeneous):
-                D = lifted(D)
-            g = g if C is None else (C @ g[..., None])[..., 0]
-            T, half = self.evaluation.linearizer.inverse_roots(V, D, lam, g)
-            if C is not None:
-                T = np.ascontiguousarray(C @ T)
-            state.damped = lam, T, half, D
-        return state.damped[1:]
+    def _damped(self, token: int, lam: float, pairs: bool = False) -> Elimination:
+        """Return the points' damped inverse roots; with new pairs of cameras, where asked for."""
+        state, own = self.states[token], self.evaluation.linearizer
+        if state.damped is not None and state.damped[0] == lam and not pairs:
+            return state.damped[1]
+        free = self._kept is None or not self._kept.any()
+        if isinstance(own, NativeLinearizer) and free and fits(own):
+            # Whatever was made before: the same bits where a partition is rebuilt.
+            local = state.cameras[self.evaluation.views]
+            made = eliminate(own, local, state.points, lam, pairs)
+            state.normal = made.normal
+        else:
+            made = self._rooted(self._normal(token), lam)
+        state.damped = lam, made._replace(pairs=None, right=None)
+        if made.singular:
+            state.damped = None
+            raise np.linalg.LinAlgError("the block of a point is not positive definite")
+        return made
+
+    def _rooted(self, normal: Normal, lam: float) -> Elimination:
+        """Return the inverse roots of any camera model; those of fixed points are zero."""
+        V, g = normal.V, normal.g_points
+        depth = None if normal.depth_blocks is None else normal.depth_blocks[1]
+        C = self._free(V)
+        V, depth = congruent(C, V), None if depth is None else congruent(C, depth)
+        D = point_damping(self.model, V, depth)
+        if not (self.model.metric or self.model.homogeneous):
+            D = lifted(D)
+        g = g if C is None else (C @ g[..., None])[..., 0]
+        T, half = self.evaluation.linearizer.inverse_roots(V, D, lam, g)
+        if C is not None:
+            T = np.ascontiguousarray(C @ T)
+        return Elimination(normal, T, half, D=D)
 
     def _free(self, V: Array) -> Array | None:
         if self._kept is None or not self._kept.any():
@@ -191,4 +225,4 @@ class _State:
     cameras: Array
     points: Array
     normal: Normal | None = None
-    damped: tuple[float, Array, Array, Array] | None = None
+    damped: tuple[float, Elimination] | None = None

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import lm
+from epigauge.bundle.dampings import START, START_METRIC
 from epigauge.bundle.freedom import Freedom
 from epigauge.bundle.linearizer import Normal
 from epigauge.bundle.problem import BundleProblem, BundleState, Estimate, in_range
@@ -18,6 +19,7 @@ from epigauge.bundle.reduced import Bordered, Iterated
 from epigauge.bundle.solve import Blocks, BundleSystem
 from epigauge.bundle.ties import congruent
 from epigauge.distributed.linearizer import DistributedCoupling, DistributedLinearizer
+from epigauge.distributed.sums import Rows
 from epigauge.distributed.worker import Recipe
 
 __all__ = ["ResidentProblem"]
@@ -87,12 +89,15 @@ class ResidentSystem(BundleSystem):
         Name of the points' state.
     peak, steepest : float
         Largest mean diagonal entry of a point's block, and largest entry of its gradient.
+    ahead : tuple or None
+        A lambda, and what eliminating the points damped by it leaves, if that is known already.
     """
 
     linearizer: DistributedLinearizer = field(kw_only=True)
     token: int = field(kw_only=True)
     peak: float = field(kw_only=True)
     steepest: float = field(kw_only=True)
+    ahead: tuple[float, Rows, Rows] | None = field(kw_only=True)
 
     @property
     def gradient(self) -> Array:
@@ -115,7 +120,10 @@ class ResidentSystem(BundleSystem):
         ties = self.ties.then(whitening, None).scaled(1.0 / np.sqrt(blocks.shared))
         white = congruent(ties.A, normal.U)
         white = white + lam * np.eye(white.shape[1])
-        (found, right), _ = own.run.each("eliminate", (self.token, lam, own.direct))
+        if self.ahead is not None and self.ahead[0] == lam:
+            _, found, right = self.ahead
+        else:
+            (found, right), _ = own.run.each("eliminate", (self.token, lam, own.direct))
         reduced: Bordered | Iterated
         if own.direct:
             reduced = Bordered(own.reduced.pairs(found), normal.U, ties, white, lam)
@@ -197,6 +205,10 @@ class ResidentProblem(BundleProblem):
         own: Any = estimate
         return BundleState(own, cost if usable else float("inf"))
 
+    def expect(self, lam: float) -> None:
+        """Take the lambda of the next step from the state to be linearised, 0 for none."""
+        self.held.expected = lam
+
     def linearize(self, state: BundleState) -> BundleSystem:
         """Return the normal equations of the cameras."""
         estimate: Any = state.estimate
@@ -205,7 +217,14 @@ class ResidentProblem(BundleProblem):
             token = held.begin(estimate.cameras, estimate.points)
         else:
             token = estimate.token
-        sums, parts = own.run.each("linearize_state", (token,))
+        lam, held.expected = held.expected, 0.0
+        sums, parts = own.run.each("linearize_state", (token, lam, own.direct))
+        ahead = None
+        if lam > 0.0:
+            found, right = sums[-2:]
+            sums = sums[:-2]
+            if not any(part["singular"] for part in parts):
+                ahead = lam, found, right
         points = own.joined([part["points"] for part in parts])
         held.accept(token, state.cameras, points)
         U, g, *depth = (own.reduced.outward(rows) for rows in sums)
@@ -226,6 +245,7 @@ class ResidentProblem(BundleProblem):
             token=token,
             peak=max(part["largest"] for part in parts),
             steepest=max(part["steepest"] for part in parts),
+            ahead=ahead,
         )
 
     def retract(self, state: BundleState, step: Any) -> Any:
@@ -267,6 +287,9 @@ class _Held:
         self._linearizer = linearizer
         self.state: tuple[int, Array, Array] | None = None
         self.trial: tuple[Any, ...] | None = None
+        #: Lambda of the next step where it is known before the state is linearised, else 0; the
+        #: first is that of `Covariant.start`.
+        self.expected = START_METRIC if linearizer.model.metric else START
         linearizer.recover = self._recovered
 
     def begin(self, cameras: Array, points: Array) -> int:
