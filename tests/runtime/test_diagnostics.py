@@ -238,3 +238,27 @@ def test_a_run_that_did_not_begin_has_flags(evidences) -> None:
     eg.refine_fundamental(x1, x2, backend="numpy")
     infinite = replace(evidences[-1][0], noise=float("inf"))
     assert diagnose(infinite, 0.0, ambiguous=False) == ("weak geometry",)
+
+
+@pytest.mark.parametrize("m", [30, 200])
+@pytest.mark.parametrize("reach", [40.0, 80.0, 160.0])
+def test_wrong_matches_near_their_own_place_are_no_geometry(m, reach) -> None:
+    """Small motions in any direction agree with every F that is nearly that of no motion."""
+    for seed in range(3):
+        rng = np.random.default_rng([m, seed])
+        x1 = rng.uniform([0.0, 0.0], [1600.0, 1200.0], (m, 2))
+        far, angle = reach * np.sqrt(rng.random(m)), rng.uniform(0.0, 2.0 * np.pi, m)
+        x2 = x1 + np.column_stack([far * np.cos(angle), far * np.sin(angle)])
+        for solve in (eg.refine_fundamental, eg.estimate_fundamental):
+            assert not solve(x1, x2).success
+
+
+def test_a_wide_noise_is_no_random_motion() -> None:
+    """Blunt matches of a scene with relief agree on its geometry as sharp ones do."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        x1, x2 = scene("general", 100, 0.0, rng)
+        wide = 0.004 * np.ptp(x1, axis=0).max()
+        x1, x2 = (x + wide * rng.standard_normal(x.shape) for x in (x1, x2))
+        for solve in (eg.refine_fundamental, eg.estimate_fundamental):
+            assert "no common geometry" not in solve(x1, x2).flags

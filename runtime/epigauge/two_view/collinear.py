@@ -54,8 +54,7 @@ def is_left_open(found: Evidence) -> bool:
 
     Where the caller says that all are right, whether the others are no more than F needs.
     """
-    noise = found.noise / math.sqrt(max(float(np.median(found.weights)), _LIGHT))
-    judged = [_off_line(q, noise) for q in (found.q1, found.q2)]
+    judged = [_off_line(q, found.noise) for q in (found.q1, found.q2)]
     lines = [off for off in judged if off is not None]
     off, needed = np.any(lines, axis=0), 2 if found.from_rays is not None else 1
     if len(lines) < needed or np.mean(off) > 1.0 - MOST_ON:

@@ -11,11 +11,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.two_view.chance import SIGNIFICANT
+from epigauge.two_view.chance import SIGNIFICANT, log10_false_alarms
 from epigauge.two_view.collinear import is_left_open
 from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.essential import Calibrated
 from epigauge.two_view.evidence import ROUNDING, Evidence
+from epigauge.two_view.homography import fit_homography, plane_squares
 from epigauge.two_view.planes import (
     HIDDEN,
     MOST_ON,
@@ -30,7 +31,16 @@ from epigauge.two_view.planes import (
 from epigauge.two_view.suspicion import WIDE, agreeing, is_common, is_inflated, is_suspicious
 from epigauge.verdicts import ordered
 
-__all__ = ["AFFINE", "PIXELS", "REDUNDANCY", "WEAK", "diagnose", "planar_bound", "still_bound"]
+__all__ = [
+    "AFFINE",
+    "BLUNT",
+    "PIXELS",
+    "REDUNDANCY",
+    "WEAK",
+    "diagnose",
+    "planar_bound",
+    "still_bound",
+]
 
 #: A redundancy below this estimates the noise worse than to 1 / sqrt(2 * 8) = 25 %.
 REDUNDANCY = 8
@@ -64,6 +74,10 @@ _NORMAL_99 = 2.326
 _CHI2_8 = 20.09
 _STILL = 0.05
 
+#: Real points are hardly measured worse than to so many pixels, in a thousandth of the focal length
+#: where the coordinates are on the retina.
+BLUNT = 4.0
+
 
 def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, ...]:
     """Return the flags that a solution raises, in the order of `verdicts.FLAGS`.
@@ -89,7 +103,8 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
 
     - no common geometry: more geometries than `chance.SIGNIFICANT` says would agree so well with
       wrong matches, with F and with the best other geometry; than one, of few matches. Matches in
-      front of one camera only do not agree;
+      front of one camera only do not agree. With a noise of more than 4 pixels, wrong matches may
+      be near where a homography takes them, and move from there in any direction;
     - gross errors: the geometry of highest likelihood under a mixture of right and wrong matches is
       no chance, leaves some far off, and the variance of those near it is less than half of s^2;
       with a robust loss, where s is more than a quarter per cent of the range of the coordinates;
@@ -136,8 +151,8 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     }
     judged = found
     # A robust loss that ends with a wide noise may have been drawn away: many were wrong.
-    doubtful = found.by_loss and found.noise > WIDE * RANGE
-    if doubtful or (not found.searched and is_suspicious(found)):
+    drawn = found.by_loss and found.noise > WIDE * RANGE
+    if drawn or (not found.searched and is_suspicious(found)):
         best = agreeing(found)
         if best.searched and is_common(best):
             judged = best
@@ -146,13 +161,34 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     # Where nothing is redundant nothing speaks against them either.
     few = raised["few matches"] and not found.searched and len(found.inlier) > found.parameters
     wide = found.noise > WIDE * RANGE
-    if (judged.searched or wide or few) and not is_common(judged, 0.0 if few else SIGNIFICANT):
+    doubtful = judged.searched or wide or few
+    if (doubtful and not is_common(judged, 0.0 if few else SIGNIFICANT)) or _is_random(judged):
         raised["no common geometry"] = True
     else:
         raised["undetermined"] = is_left_open(judged)
         for name, is_raised in _plane(judged).items():
             raised[name] = is_raised or raised.get(name, False)
     return ordered(name for name, is_raised in raised.items() if is_raised)
+
+
+def _is_random(found: Evidence) -> bool:
+    """Tell whether wrong matches that hardly move would agree as well.
+
+    F follows from the direction in which matches move off the homography that most are on. A wrong
+    one that is d off has any, and is within a distance l of a line with the probability
+    2 / pi asin(l / d). Noise that hides the relief of a distant scene looks alike but for its size
+    in pixels.
+    """
+    blunt = BLUNT / 1000.0 if found.retina else BLUNT
+    if found.noise <= max(WIDE * RANGE, blunt * float(found.to_units1[0, 0])):
+        return False
+    H = fit_homography(found.q1, found.q2, found.weights, found.table)[0]
+    apart = plane_squares(found.table, H, found.all1, found.all2)
+    with np.errstate(divide="ignore"):  # on the plane
+        sine = found.limit / np.sqrt(apart)
+    chance = float(np.mean(2.0 / np.pi * np.arcsin(np.minimum(sine, 1.0))))
+    m, agreed = len(found.inlier), int(np.count_nonzero(found.inlier))
+    return log10_false_alarms(m, agreed, chance, found.parameters) > SIGNIFICANT
 
 
 def _extent(found: Evidence) -> float:

@@ -14,7 +14,7 @@ from epigauge.two_view.criteria import Reprojection
 from epigauge.two_view.essential import Motion
 from epigauge.two_view.solve import Matches, Options, Solution
 
-__all__ = ["ROUNDING", "WITHIN", "Evidence", "evidence", "oriented_matches"]
+__all__ = ["ROUNDING", "WITHIN", "Evidence", "evidence", "of_median_one", "oriented_matches"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -39,7 +39,9 @@ class Evidence:
     all1, all2 : ndarray, shape (2, n)
         All matches of positive weight, each of several equal ones once.
     all_weights : ndarray, shape (n,)
-        Their weights.
+        Their weights, of median one: a common factor changes nothing that is judged.
+    unit : float
+        The median of the weights as they were given.
     inlier : ndarray of bool, shape (n,)
         Which of them count for F.
     limit : float
@@ -51,7 +53,7 @@ class Evidence:
     to_units1, to_units2 : ndarray, shape (3, 3)
         Maps of the images from pixels to these coordinates.
     noise : float
-        Standard deviation of a coordinate, from the residuals of the inliers.
+        Standard deviation of a coordinate of weight one, from the residuals of the inliers.
     parameters : int
         Number of parameters of F.
     retina : bool
@@ -67,6 +69,7 @@ class Evidence:
     all1: Array
     all2: Array
     all_weights: Array
+    unit: float = 1.0
     inlier: Mask
     limit: float
     searched: bool
@@ -122,7 +125,8 @@ class Evidence:
     ) -> Evidence:
         """Return the evidence for the same F among other matches, chosen by F, in pixels."""
         counts = weights > 0.0
-        inlier, weights, limit = inlier[counts], weights[counts], limit_px * self.to_units1[0, 0]
+        inlier, limit = inlier[counts], limit_px * self.to_units1[0, 0]
+        weights, unit = of_median_one(weights[counts])
         q1, q2 = (
             np.ascontiguousarray((x[counts] * M[0, 0] + M[:2, 2]).T)
             for x, M in ((x1, self.to_units1), (x2, self.to_units2))
@@ -132,6 +136,7 @@ class Evidence:
             all1=q1,
             all2=q2,
             all_weights=weights,
+            unit=unit,
             inlier=inlier,
             limit=float(limit),
             searched=True,
@@ -171,12 +176,15 @@ def evidence(
         from_rays = (to_units1 @ calibration[0], to_units2 @ calibration[1])
         unexplained = weights * motion.excess[counts] > (WITHIN * noise) ** 2
         n_behind = int(np.count_nonzero(inlier & unexplained))
+    weights, unit = of_median_one(weights)
+    noise /= float(np.sqrt(unit))
     return Evidence(
         table=matches.table,
         F=solution.F,
         all1=q1,
         all2=q2,
         all_weights=weights,
+        unit=unit,
         inlier=inlier,
         limit=WITHIN * noise,
         searched=loss.name != "linear",
@@ -189,6 +197,12 @@ def evidence(
         from_rays=from_rays,
         n_behind=n_behind,
     )
+
+
+def of_median_one(weights: Array) -> tuple[Array, float]:
+    """Return positive weights divided by their median, and the median."""
+    unit = float(np.median(weights)) if len(weights) else 1.0
+    return (weights, 1.0) if unit == 1.0 else (weights / unit, unit)
 
 
 def oriented_matches(F: Array, q1_hat: Array, q2_hat: Array, noise: float) -> Mask:

@@ -24,8 +24,8 @@ from epigauge.two_view import native
 from epigauge.two_view.chance import CEILING, PAIRS, RANK, SIGNIFICANT, log10_false_alarms
 from epigauge.two_view.collinear import may_be_lines
 from epigauge.two_view.consensus import RANGE
-from epigauge.two_view.diagnostics import AFFINE, PIXELS, REDUNDANCY, WEAK, planar_bound
-from epigauge.two_view.evidence import WITHIN
+from epigauge.two_view.diagnostics import AFFINE, BLUNT, PIXELS, REDUNDANCY, WEAK, planar_bound
+from epigauge.two_view.evidence import WITHIN, of_median_one
 from epigauge.two_view.planes import (
     BESIDE,
     FAR_OFF,
@@ -147,7 +147,11 @@ def verdicts_of(
         One entry a pair; flags are None where these tests do not suffice.
     """
     found: list[tuple[tuple[str, ...] | None, bool]] = []
+    if weights is not None:
+        weights, units = _of_median_one(weights, offsets)
     rows = [Facts(*row) for row in _facts(pair, x1, x2, offsets, weights, pair.distances, _OPTIONS)]
+    if weights is not None:
+        rows = [row._replace(least=row.least / unit) for row, unit in zip(rows, units, strict=True)]
     noise_px = pair.table[:, 35] * [_noise(own) for own in rows]
     on_lines = may_be_lines(x1, x2, offsets, noise_px, weights).tolist()
     for row, scale, own, doubtful in zip(
@@ -185,7 +189,9 @@ def verdict_of_raw(
         Returns the probability that a wrong match agrees (`chance.chance_agreement`).
     """
     x1, x2, weights = matches
-    counts, agreed = weights > 0.0, np.where(agreeing, weights, 0.0)
+    counts = weights > 0.0
+    unit = of_median_one(weights[counts])[1]
+    agreed = np.where(agreeing, weights / unit, 0.0)
     if np.count_nonzero(agreed) < _FREE + REDUNDANCY:
         return None, False
     row = _facts(
@@ -196,6 +202,7 @@ def verdict_of_raw(
         _SEARCHED,
     )[0]
     own, scale = Facts(*row), float(pair.table[0, 35])
+    own = own._replace(least=own.least / unit)
     if limit_px > CEILING * RANGE * scale:
         return None, False
     if own.squares > (own.number - _FREE) * (HIDDEN * RANGE) ** 2:
@@ -240,6 +247,17 @@ def _facts(
         raise MemoryError(f"no room for {len(x1)} matches")
     rows: list[list[float]] = table.tolist()
     return rows
+
+
+def _of_median_one(weights: Array, offsets: NDArray[np.intp]) -> tuple[Array, list[float]]:
+    """Return weights divided by the median of the positive ones of their pair, and the medians."""
+    weights, units = weights.copy(), []
+    for begin, end in zip(offsets[:-1].tolist(), offsets[1:].tolist(), strict=True):
+        own = weights[begin:end]
+        positive = own > 0.0
+        own[positive], unit = of_median_one(own[positive])
+        units.append(unit)
+    return weights, units
 
 
 def flags(own: Facts, scale: float) -> tuple[str, ...] | None:
@@ -288,6 +306,8 @@ def _plain_flags(own: Facts, scale: float) -> tuple[str, ...] | None:
     noise2 = squares / (n - _FREE)
     if noise2 < _EXACT**2 or not own.least > 0.0:
         return None
+    if noise2 > (1.0 - _CLOSE) * max(WIDE * RANGE, BLUNT / scale) ** 2:
+        return None  # wrong matches may be near where a homography takes them
     weak = noise2 > WEAK**2 * own.least
     affine = own.affine <= squares + AFFINE * noise2
     return ("weak geometry",) * weak + ("near-affine",) * affine
