@@ -7,7 +7,7 @@
 
 const char *eg_digest(void)
 {
-    return "b07171ef06431f58";
+    return "2d727184f1259a28";
 }
 
 const char *eg_sources(void)

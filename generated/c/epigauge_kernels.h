@@ -1239,6 +1239,28 @@ EG_EXPORT void eg_line_generators(
     const double *EG_RESTRICT origin,
     double *EG_RESTRICT N);
 
+EG_EXPORT void eg_line_transform(
+    ptrdiff_t n,
+    const double *EG_RESTRICT T,
+    const double *EG_RESTRICT line,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_projective_line_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT line,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved);
+
+EG_EXPORT void eg_projective_line_tangent(
+    ptrdiff_t n,
+    const double *EG_RESTRICT line,
+    double *EG_RESTRICT T);
+
+EG_EXPORT void eg_projective_line_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT line,
+    double *EG_RESTRICT N);
+
 EG_EXPORT void eg_pinhole_line_residual(
     ptrdiff_t n,
     const double *EG_RESTRICT camera,
@@ -1252,6 +1274,24 @@ EG_EXPORT void eg_pinhole_line_observe(
     const double *EG_RESTRICT camera,
     const double *EG_RESTRICT line,
     const double *EG_RESTRICT origin,
+    const double *EG_RESTRICT segment,
+    const double *EG_RESTRICT spread,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_line);
+
+EG_EXPORT void eg_projective_line_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT line,
+    const double *EG_RESTRICT segment,
+    const double *EG_RESTRICT spread,
+    double *EG_RESTRICT r);
+
+EG_EXPORT void eg_projective_line_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT line,
     const double *EG_RESTRICT segment,
     const double *EG_RESTRICT spread,
     double *EG_RESTRICT r,

@@ -511,6 +511,406 @@ EG_EXPORT void eg_line_generators(
     }
 }
 
+/* Formula: line (n, v) where points X are moved to T X: the exterior square of T times it.
+   Inputs:  T (4, 4), line (6,)
+   Outputs: moved (6,)
+   Operations: 102, temporaries: 12. */
+EG_EXPORT void eg_line_transform(
+    ptrdiff_t n,
+    const double *EG_RESTRICT T,
+    const double *EG_RESTRICT line,
+    double *EG_RESTRICT moved)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double T00 = T[i];
+        const double T01 = T[n + i];
+        const double T02 = T[2*n + i];
+        const double T03 = T[3*n + i];
+        const double T10 = T[4*n + i];
+        const double T11 = T[5*n + i];
+        const double T12 = T[6*n + i];
+        const double T13 = T[7*n + i];
+        const double T20 = T[8*n + i];
+        const double T21 = T[9*n + i];
+        const double T22 = T[10*n + i];
+        const double T23 = T[11*n + i];
+        const double T30 = T[12*n + i];
+        const double T31 = T[13*n + i];
+        const double T32 = T[14*n + i];
+        const double T33 = T[15*n + i];
+        const double nx = line[i];
+        const double ny = line[n + i];
+        const double nz = line[2*n + i];
+        const double vx = line[3*n + i];
+        const double vy = line[4*n + i];
+        const double vz = line[5*n + i];
+        const double t0 = T20*vx + T21*vy + T22*vz;
+        const double t1 = T21*nz - T22*ny - T23*vx;
+        const double t2 = T22*nx - T20*nz - T23*vy;
+        const double t3 = T20*ny - T21*nx - T23*vz;
+        const double t4 = T00*vx + T01*vy + T02*vz;
+        const double t5 = T01*nz - T02*ny - T03*vx;
+        const double t6 = T02*nx - T00*nz - T03*vy;
+        const double t7 = T00*ny - T01*nx - T03*vz;
+        const double t10 = T12*nx - T10*nz - T13*vy;
+        const double t11 = T10*ny - T11*nx - T13*vz;
+        const double t8 = T10*vx + T11*vy + T12*vz;
+        const double t9 = T11*nz - T12*ny - T13*vx;
+        moved[i] = T10*t1 + T11*t2 + T12*t3 + T13*t0;
+        moved[n + i] = T20*t5 + T21*t6 + T22*t7 + T23*t4;
+        moved[2*n + i] = T00*t9 + T01*t10 + T02*t11 + T03*t8;
+        moved[3*n + i] = T30*t5 + T31*t6 + T32*t7 + T33*t4;
+        moved[4*n + i] = T30*t9 + T31*t10 + T32*t11 + T33*t8;
+        moved[5*n + i] = T30*t1 + T31*t2 + T32*t3 + T33*t0;
+    }
+}
+
+/* Formula: line of length one, moved by turning the directions n + v and n - v by two numbers
+   each: the orthonormal representation (Bartoli & Sturm, CVIU 2005) in four dimensions.
+   Inputs:  line (6,), delta (4,)
+   Outputs: moved (6,)
+   Operations: 124, temporaries: 43. */
+EG_EXPORT void eg_projective_line_retract(
+    ptrdiff_t n,
+    const double *EG_RESTRICT line,
+    const double *EG_RESTRICT delta,
+    double *EG_RESTRICT moved)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double nx = line[i];
+        const double ny = line[n + i];
+        const double nz = line[2*n + i];
+        const double vx = line[3*n + i];
+        const double vy = line[4*n + i];
+        const double vz = line[5*n + i];
+        const double delta0 = delta[i];
+        const double delta1 = delta[n + i];
+        const double delta2 = delta[2*n + i];
+        const double delta3 = delta[3*n + i];
+        const double t0 = nx + vx;
+        const double t1 = ny + vy;
+        const double t2 = nz + vz;
+        const double t3 = 1.0/sqrt(t0*t0 + t1*t1 + t2*t2);
+        const double sum0 = t0*t3;
+        const double sum2 = t2*t3;
+        const double t8 = (sum2 > 0.0 ? 1.0 : -1.0);
+        const double t9 = 1.0/(sum2 + t8);
+        const double across_sum00 = 1.0 - sum0*sum0*t8*t9;
+        const double sum1 = t1*t3;
+        const double t10 = sum1*t9;
+        const double across_sum01 = -sum0*t10;
+        const double t16 = sum0 + across_sum00*delta0 + across_sum01*delta1;
+        const double t17 = 1.0/sqrt(1.0 + delta0*delta0 + delta1*delta1);
+        const double t18 = 0.5*t17;
+        const double t4 = nx - vx;
+        const double t5 = ny - vy;
+        const double t6 = nz - vz;
+        const double t7 = 1.0/sqrt(t4*t4 + t5*t5 + t6*t6);
+        const double rest0 = t4*t7;
+        const double rest2 = t6*t7;
+        const double t12 = (rest2 > 0.0 ? 1.0 : -1.0);
+        const double t13 = 1.0/(rest2 + t12);
+        const double across_rest00 = 1.0 - rest0*rest0*t12*t13;
+        const double rest1 = t5*t7;
+        const double t14 = rest1*t13;
+        const double across_rest01 = -rest0*t14;
+        const double t19 = 0.5/sqrt(1.0 + delta2*delta2 + delta3*delta3);
+        const double t20 = t19*(rest0 + across_rest00*delta2 + across_rest01*delta3);
+        const double t11 = sum0*t8;
+        const double across_sum10 = -t10*t11;
+        const double across_sum11 = t8 - sum1*sum1*t9;
+        const double t21 = sum1 + across_sum10*delta0 + across_sum11*delta1;
+        const double t15 = rest0*t12;
+        const double across_rest10 = -t14*t15;
+        const double across_rest11 = t12 - rest1*rest1*t13;
+        const double t22 = t19*(rest1 + across_rest10*delta2 + across_rest11*delta3);
+        const double across_sum20 = -t11;
+        const double across_sum21 = -sum1;
+        const double t23 = sum2 + across_sum20*delta0 + across_sum21*delta1;
+        const double across_rest20 = -t15;
+        const double across_rest21 = -rest1;
+        const double t24 = t19*(rest2 + across_rest20*delta2 + across_rest21*delta3);
+        moved[i] = t20 + t16*t18;
+        moved[n + i] = t22 + t18*t21;
+        moved[2*n + i] = t24 + t18*t23;
+        moved[3*n + i] = 0.5*t16*t17 - t20;
+        moved[4*n + i] = 0.5*t17*t21 - t22;
+        moved[5*n + i] = 0.5*t17*t23 - t24;
+    }
+}
+
+/* Formula: derivative of the line of length one by that update, at none.
+   Inputs:  line (6,)
+   Outputs: T (6, 4)
+   Operations: 84, temporaries: 46. */
+EG_EXPORT void eg_projective_line_tangent(
+    ptrdiff_t n,
+    const double *EG_RESTRICT line,
+    double *EG_RESTRICT T)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double nx = line[i];
+        const double ny = line[n + i];
+        const double nz = line[2*n + i];
+        const double vx = line[3*n + i];
+        const double vy = line[4*n + i];
+        const double vz = line[5*n + i];
+        const double t0 = nx + vx;
+        const double t1 = ny + vy;
+        const double t2 = nz + vz;
+        const double t3 = 1.0/sqrt(t0*t0 + t1*t1 + t2*t2);
+        const double sum0 = t0*t3;
+        const double sum2 = t2*t3;
+        const double t8 = (sum2 > 0.0 ? 1.0 : -1.0);
+        const double t9 = 1.0/(sum2 + t8);
+        const double across_sum00 = 1.0 - sum0*sum0*t8*t9;
+        const double t16 = 0.5*across_sum00;
+        const double sum1 = t1*t3;
+        const double t10 = sum1*t9;
+        const double across_sum01 = -sum0*t10;
+        const double t17 = 0.5*across_sum01;
+        const double t4 = nx - vx;
+        const double t5 = ny - vy;
+        const double t6 = nz - vz;
+        const double t7 = 1.0/sqrt(t4*t4 + t5*t5 + t6*t6);
+        const double rest0 = t4*t7;
+        const double rest2 = t6*t7;
+        const double t12 = (rest2 > 0.0 ? 1.0 : -1.0);
+        const double t13 = 1.0/(rest2 + t12);
+        const double across_rest00 = 1.0 - rest0*rest0*t12*t13;
+        const double t18 = 0.5*across_rest00;
+        const double rest1 = t5*t7;
+        const double t14 = rest1*t13;
+        const double across_rest01 = -rest0*t14;
+        const double t19 = 0.5*across_rest01;
+        const double t11 = sum0*t8;
+        const double across_sum10 = -t10*t11;
+        const double t20 = 0.5*across_sum10;
+        const double across_sum11 = t8 - sum1*sum1*t9;
+        const double t21 = 0.5*across_sum11;
+        const double t15 = rest0*t12;
+        const double across_rest10 = -t14*t15;
+        const double t22 = 0.5*across_rest10;
+        const double across_rest11 = t12 - rest1*rest1*t13;
+        const double t23 = 0.5*across_rest11;
+        const double across_sum20 = -t11;
+        const double t24 = 0.5*across_sum20;
+        const double across_sum21 = -sum1;
+        const double t25 = 0.5*across_sum21;
+        const double across_rest20 = -t15;
+        const double t26 = 0.5*across_rest20;
+        const double across_rest21 = -rest1;
+        const double t27 = 0.5*across_rest21;
+        T[i] = t16;
+        T[n + i] = t17;
+        T[2*n + i] = t18;
+        T[3*n + i] = t19;
+        T[4*n + i] = t20;
+        T[5*n + i] = t21;
+        T[6*n + i] = t22;
+        T[7*n + i] = t23;
+        T[8*n + i] = t24;
+        T[9*n + i] = t25;
+        T[10*n + i] = t26;
+        T[11*n + i] = t27;
+        T[12*n + i] = t16;
+        T[13*n + i] = t17;
+        T[14*n + i] = -t18;
+        T[15*n + i] = -t19;
+        T[16*n + i] = t20;
+        T[17*n + i] = t21;
+        T[18*n + i] = -t22;
+        T[19*n + i] = -t23;
+        T[20*n + i] = t24;
+        T[21*n + i] = t25;
+        T[22*n + i] = -t26;
+        T[23*n + i] = -t27;
+    }
+}
+
+/* Formula: updates of a line of length one by the gauge of projective cameras: translation x,
+   translation y, translation z, E01, E02, E10, E11-E00, E12, E20, E21, E22-E00, E30, E31,
+   E32, E33-E00.
+   Inputs:  line (6,)
+   Outputs: N (4, 15)
+   Operations: 260, temporaries: 98. */
+EG_EXPORT void eg_projective_line_generators(
+    ptrdiff_t n,
+    const double *EG_RESTRICT line,
+    double *EG_RESTRICT N)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double nx = line[i];
+        const double ny = line[n + i];
+        const double nz = line[2*n + i];
+        const double vx = line[3*n + i];
+        const double vy = line[4*n + i];
+        const double vz = line[5*n + i];
+        const double t1 = ny + vy;
+        const double t0 = nx + vx;
+        const double t2 = nz + vz;
+        const double t3 = 1.0/sqrt(t0*t0 + t1*t1 + t2*t2);
+        const double sum1 = t1*t3;
+        const double sum2 = t2*t3;
+        const double t8 = (sum2 > 0.0 ? 1.0 : -1.0);
+        const double t9 = 1.0/(sum2 + t8);
+        const double t10 = sum1*t9;
+        const double sum0 = t0*t3;
+        const double t11 = sum0*t8;
+        const double across_sum10 = -t10*t11;
+        const double t16 = across_sum10*vz;
+        const double across_sum20 = -t11;
+        const double t17 = -across_sum20*vy;
+        const double across_sum00 = 1.0 - sum0*sum0*t8*t9;
+        const double t18 = across_sum00*vz;
+        const double t19 = -across_sum20*vx;
+        const double t20 = across_sum00*vy;
+        const double t21 = -across_sum10*vx;
+        const double t22 = -across_sum10*nx;
+        const double t23 = -across_sum20*nx;
+        const double t24 = across_sum00*ny;
+        const double t25 = across_sum10*ny;
+        const double t26 = across_sum00*nx - across_sum00*vx;
+        const double t27 = -across_sum20*ny;
+        const double t28 = across_sum00*nz;
+        const double t29 = across_sum10*nz;
+        const double t30 = across_sum20*nz;
+        const double across_sum11 = t8 - sum1*sum1*t9;
+        const double t31 = across_sum11*vz;
+        const double across_sum21 = -sum1;
+        const double t32 = -across_sum21*vy;
+        const double across_sum01 = -sum0*t10;
+        const double t33 = across_sum01*vz;
+        const double t34 = -across_sum21*vx;
+        const double t35 = across_sum01*vy;
+        const double t36 = -across_sum11*vx;
+        const double t37 = -across_sum11*nx;
+        const double t38 = -across_sum21*nx;
+        const double t39 = across_sum01*ny;
+        const double t40 = across_sum11*ny;
+        const double t41 = across_sum01*nx - across_sum01*vx;
+        const double t42 = -across_sum21*ny;
+        const double t43 = across_sum01*nz;
+        const double t44 = across_sum11*nz;
+        const double t45 = across_sum21*nz;
+        const double t5 = ny - vy;
+        const double t4 = nx - vx;
+        const double t6 = nz - vz;
+        const double t7 = 1.0/sqrt(t4*t4 + t5*t5 + t6*t6);
+        const double rest1 = t5*t7;
+        const double rest2 = t6*t7;
+        const double t12 = (rest2 > 0.0 ? 1.0 : -1.0);
+        const double t13 = 1.0/(rest2 + t12);
+        const double t14 = rest1*t13;
+        const double rest0 = t4*t7;
+        const double t15 = rest0*t12;
+        const double across_rest10 = -t14*t15;
+        const double t46 = across_rest10*vz;
+        const double across_rest20 = -t15;
+        const double t47 = across_rest20*vy;
+        const double across_rest00 = 1.0 - rest0*rest0*t12*t13;
+        const double t48 = across_rest00*vz;
+        const double t49 = across_rest20*vx;
+        const double t50 = across_rest00*vy;
+        const double t51 = across_rest10*vx;
+        const double t52 = across_rest10*nx;
+        const double t53 = across_rest20*nx;
+        const double t54 = across_rest00*ny;
+        const double t55 = across_rest10*ny;
+        const double t56 = across_rest10*vy;
+        const double t57 = across_rest00*nx + across_rest00*vx;
+        const double t58 = across_rest20*ny;
+        const double t59 = across_rest00*nz;
+        const double t60 = across_rest10*nz;
+        const double t61 = across_rest20*nz;
+        const double t62 = across_rest20*vz;
+        const double across_rest11 = t12 - rest1*rest1*t13;
+        const double t63 = across_rest11*vz;
+        const double across_rest21 = -rest1;
+        const double t64 = across_rest21*vy;
+        const double across_rest01 = -rest0*t14;
+        const double t65 = across_rest01*vz;
+        const double t66 = across_rest21*vx;
+        const double t67 = across_rest01*vy;
+        const double t68 = across_rest11*vx;
+        const double t69 = across_rest11*nx;
+        const double t70 = across_rest21*nx;
+        const double t71 = across_rest01*ny;
+        const double t72 = across_rest11*ny;
+        const double t73 = across_rest11*vy;
+        const double t74 = across_rest01*nx + across_rest01*vx;
+        const double t75 = across_rest21*ny;
+        const double t76 = across_rest01*nz;
+        const double t77 = across_rest11*nz;
+        const double t78 = across_rest21*nz;
+        const double t79 = across_rest21*vz;
+        N[i] = -t16 - t17;
+        N[n + i] = t18 + t19;
+        N[2*n + i] = -t20 - t21;
+        N[3*n + i] = t20 + t22;
+        N[4*n + i] = t18 + t23;
+        N[5*n + i] = -t21 - t24;
+        N[6*n + i] = t26 + across_sum10*vy - t25;
+        N[7*n + i] = t16 + t27;
+        N[8*n + i] = -t19 - t28;
+        N[9*n + i] = -t17 - t29;
+        N[10*n + i] = t26 + across_sum20*vz - t30;
+        N[11*n + i] = t27 + t29;
+        N[12*n + i] = -t23 - t28;
+        N[13*n + i] = t22 + t24;
+        N[14*n + i] = across_sum10*vy + across_sum20*vz - t25 - t30;
+        N[15*n + i] = -t31 - t32;
+        N[16*n + i] = t33 + t34;
+        N[17*n + i] = -t35 - t36;
+        N[18*n + i] = t35 + t37;
+        N[19*n + i] = t33 + t38;
+        N[20*n + i] = -t36 - t39;
+        N[21*n + i] = t41 + across_sum11*vy - t40;
+        N[22*n + i] = t31 + t42;
+        N[23*n + i] = -t34 - t43;
+        N[24*n + i] = -t32 - t44;
+        N[25*n + i] = t41 + across_sum21*vz - t45;
+        N[26*n + i] = t42 + t44;
+        N[27*n + i] = -t38 - t43;
+        N[28*n + i] = t37 + t39;
+        N[29*n + i] = across_sum11*vy + across_sum21*vz - t40 - t45;
+        N[30*n + i] = t47 - t46;
+        N[31*n + i] = t48 - t49;
+        N[32*n + i] = t51 - t50;
+        N[33*n + i] = -t50 - t52;
+        N[34*n + i] = -t48 - t53;
+        N[35*n + i] = -t51 - t54;
+        N[36*n + i] = t57 - t55 - t56;
+        N[37*n + i] = -t46 - t58;
+        N[38*n + i] = -t49 - t59;
+        N[39*n + i] = -t47 - t60;
+        N[40*n + i] = t57 - t61 - t62;
+        N[41*n + i] = t58 - t60;
+        N[42*n + i] = t59 - t53;
+        N[43*n + i] = t52 - t54;
+        N[44*n + i] = -t55 - t56 - t61 - t62;
+        N[45*n + i] = t64 - t63;
+        N[46*n + i] = t65 - t66;
+        N[47*n + i] = t68 - t67;
+        N[48*n + i] = -t67 - t69;
+        N[49*n + i] = -t65 - t70;
+        N[50*n + i] = -t68 - t71;
+        N[51*n + i] = t74 - t72 - t73;
+        N[52*n + i] = -t63 - t75;
+        N[53*n + i] = -t66 - t76;
+        N[54*n + i] = -t64 - t77;
+        N[55*n + i] = t74 - t78 - t79;
+        N[56*n + i] = t75 - t77;
+        N[57*n + i] = t76 - t70;
+        N[58*n + i] = t69 - t71;
+        N[59*n + i] = -t72 - t73 - t78 - t79;
+    }
+}
+
 /* Formula: signed distances of both end points of a segment to the image of a line in the
    camera PINHOLE, over their standard deviations.
    Inputs:  camera (16,), line (6,), segment (4,), spread (6,)
@@ -766,6 +1166,268 @@ EG_EXPORT void eg_pinhole_line_observe(
         J_line[5*n + i] = -slope10*t70 - slope11*t71 - slope12*t72;
         J_line[6*n + i] = -slope10*t82 - slope11*t83 - slope12*t84;
         J_line[7*n + i] = -slope10*t88 - slope11*t89 - slope12*t90;
+    }
+}
+
+/* Formula: signed distances of both end points of a segment to the image of a line in the
+   camera projective, over their standard deviations.
+   Inputs:  camera (12,), line (6,), segment (4,), spread (6,)
+   Outputs: r (2,)
+   Operations: 97, temporaries: 9. */
+EG_EXPORT void eg_projective_line_residual(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT line,
+    const double *EG_RESTRICT segment,
+    const double *EG_RESTRICT spread,
+    double *EG_RESTRICT r)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double P00 = camera[i];
+        const double P01 = camera[n + i];
+        const double P02 = camera[2*n + i];
+        const double P03 = camera[3*n + i];
+        const double P10 = camera[4*n + i];
+        const double P11 = camera[5*n + i];
+        const double P12 = camera[6*n + i];
+        const double P13 = camera[7*n + i];
+        const double P20 = camera[8*n + i];
+        const double P21 = camera[9*n + i];
+        const double P22 = camera[10*n + i];
+        const double P23 = camera[11*n + i];
+        const double nx = line[i];
+        const double ny = line[n + i];
+        const double nz = line[2*n + i];
+        const double vx = line[3*n + i];
+        const double vy = line[4*n + i];
+        const double vz = line[5*n + i];
+        const double x1 = segment[i];
+        const double y1 = segment[n + i];
+        const double x2 = segment[2*n + i];
+        const double y2 = segment[3*n + i];
+        const double xx1 = spread[i];
+        const double xy1 = spread[n + i];
+        const double yy1 = spread[2*n + i];
+        const double xx2 = spread[3*n + i];
+        const double xy2 = spread[4*n + i];
+        const double yy2 = spread[5*n + i];
+        const double t0 = P20*vx + P21*vy + P22*vz;
+        const double t1 = P10*vx + P11*vy + P12*vz;
+        const double seen0 = P13*t0 + nx*(P11*P22 - P12*P21) + ny*(P12*P20 - P10*P22) + nz*(P10*P21 - P11*P20) - P23*t1;
+        const double t2 = P00*vx + P01*vy + P02*vz;
+        const double seen1 = P23*t2 + nx*(P02*P21 - P01*P22) + ny*(P00*P22 - P02*P20) + nz*(P01*P20 - P00*P21) - P03*t0;
+        const double seen2 = P03*t1 + nx*(P01*P12 - P02*P11) + ny*(P02*P10 - P00*P12) + nz*(P00*P11 - P01*P10) - P13*t2;
+        const double t3 = seen0*seen0;
+        const double t4 = seen1*seen1;
+        const double t5 = 2.0*seen0*seen1;
+        r[i] = (seen2 + seen0*x1 + seen1*y1)/sqrt(t3*xx1 + t4*yy1 + t5*xy1);
+        r[n + i] = (seen2 + seen0*x2 + seen1*y2)/sqrt(t3*xx2 + t4*yy2 + t5*xy2);
+    }
+}
+
+/* Formula: projective_line_residual, and minus its derivatives by the update of the camera
+   (dP00, dP01, dP02, dP03, dP10, dP11, dP12, dP13, dP20, dP21, dP22, dP23) and by that of the
+   line in four dimensions.
+   Inputs:  camera (12,), line (6,), segment (4,), spread (6,)
+   Outputs: r (2,), J_camera (2, 12), J_line (2, 4)
+   Operations: 588, temporaries: 122. */
+EG_EXPORT void eg_projective_line_observe(
+    ptrdiff_t n,
+    const double *EG_RESTRICT camera,
+    const double *EG_RESTRICT line,
+    const double *EG_RESTRICT segment,
+    const double *EG_RESTRICT spread,
+    double *EG_RESTRICT r,
+    double *EG_RESTRICT J_camera,
+    double *EG_RESTRICT J_line)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double P00 = camera[i];
+        const double P01 = camera[n + i];
+        const double P02 = camera[2*n + i];
+        const double P03 = camera[3*n + i];
+        const double P10 = camera[4*n + i];
+        const double P11 = camera[5*n + i];
+        const double P12 = camera[6*n + i];
+        const double P13 = camera[7*n + i];
+        const double P20 = camera[8*n + i];
+        const double P21 = camera[9*n + i];
+        const double P22 = camera[10*n + i];
+        const double P23 = camera[11*n + i];
+        const double nx = line[i];
+        const double ny = line[n + i];
+        const double nz = line[2*n + i];
+        const double vx = line[3*n + i];
+        const double vy = line[4*n + i];
+        const double vz = line[5*n + i];
+        const double x1 = segment[i];
+        const double y1 = segment[n + i];
+        const double x2 = segment[2*n + i];
+        const double y2 = segment[3*n + i];
+        const double xx1 = spread[i];
+        const double xy1 = spread[n + i];
+        const double yy1 = spread[2*n + i];
+        const double xx2 = spread[3*n + i];
+        const double xy2 = spread[4*n + i];
+        const double yy2 = spread[5*n + i];
+        const double t0 = P11*P22 - P12*P21;
+        const double t1 = P12*P20 - P10*P22;
+        const double t2 = P10*P21 - P11*P20;
+        const double t3 = P20*vx + P21*vy + P22*vz;
+        const double t4 = P10*vx + P11*vy + P12*vz;
+        const double seen0 = P13*t3 + nx*t0 + ny*t1 + nz*t2 - P23*t4;
+        const double t12 = seen0*seen0;
+        const double t5 = P02*P21 - P01*P22;
+        const double t6 = P00*P22 - P02*P20;
+        const double t7 = P01*P20 - P00*P21;
+        const double t8 = P00*vx + P01*vy + P02*vz;
+        const double seen1 = P23*t8 + nx*t5 + ny*t6 + nz*t7 - P03*t3;
+        const double t13 = seen1*seen1;
+        const double t14 = seen1*xy1;
+        const double t15 = 2.0*seen0;
+        const double t16 = t12*xx1 + t13*yy1 + t14*t15;
+        const double t17 = 1.0/sqrt(t16);
+        const double t10 = P02*P10 - P00*P12;
+        const double t11 = P00*P11 - P01*P10;
+        const double t9 = P01*P12 - P02*P11;
+        const double seen2 = P03*t4 + nx*t9 + ny*t10 + nz*t11 - P13*t8;
+        const double t18 = seen2 + seen0*x1 + seen1*y1;
+        const double t20 = seen1*xy2;
+        const double t21 = t12*xx2 + t13*yy2 + t15*t20;
+        const double t22 = 1.0/sqrt(t21);
+        const double t23 = seen2 + seen0*x2 + seen1*y2;
+        const double t19 = t18/(t16*sqrt(t16));
+        const double slope01 = t17*y1 + t19*(-seen0*xy1 - seen1*yy1);
+        const double slope02 = t17;
+        const double t41 = P22*ny + P23*vx - P21*nz;
+        const double t42 = P12*ny + P13*vx - P11*nz;
+        const double t43 = -t42;
+        const double t44 = P20*nz + P23*vy - P22*nx;
+        const double t45 = P10*nz + P13*vy - P12*nx;
+        const double t46 = -t45;
+        const double t47 = P21*nx + P23*vz - P20*ny;
+        const double t48 = P11*nx + P13*vz - P10*ny;
+        const double t49 = -t48;
+        const double t50 = -t3;
+        const double slope00 = t17*x1 + t19*(-t14 - seen0*xx1);
+        const double t51 = P02*ny + P03*vx - P01*nz;
+        const double t52 = -t41;
+        const double t53 = P00*nz + P03*vy - P02*nx;
+        const double t54 = -t44;
+        const double t55 = P01*nx + P03*vz - P00*ny;
+        const double t56 = -t47;
+        const double t57 = -t8;
+        const double t58 = -t51;
+        const double t59 = -t53;
+        const double t60 = -t55;
+        const double t61 = -t4;
+        const double t24 = t23/(t21*sqrt(t21));
+        const double slope11 = t22*y2 + t24*(-seen0*xy2 - seen1*yy2);
+        const double slope12 = t22;
+        const double slope10 = t22*x2 + t24*(-t20 - seen0*xx2);
+        const double t62 = P13*P20 - P10*P23;
+        const double t25 = nx + vx;
+        const double t26 = ny + vy;
+        const double t27 = nz + vz;
+        const double t28 = 1.0/sqrt(t25*t25 + t26*t26 + t27*t27);
+        const double sum0 = t25*t28;
+        const double sum2 = t27*t28;
+        const double t33 = (sum2 > 0.0 ? 1.0 : -1.0);
+        const double t34 = 1.0/(sum2 + t33);
+        const double across_sum00 = 1.0 - sum0*sum0*t33*t34;
+        const double t63 = 0.5*across_sum00;
+        const double sum1 = t26*t28;
+        const double t35 = sum1*t34;
+        const double t36 = sum0*t33;
+        const double across_sum10 = -t35*t36;
+        const double t64 = 0.5*across_sum10;
+        const double t65 = P13*P21 - P11*P23;
+        const double across_sum20 = -t36;
+        const double t66 = 0.5*across_sum20;
+        const double t67 = P13*P22 - P12*P23;
+        const double t68 = t0*t63 + t1*t64 + t2*t66 + t62*t63 + t64*t65 + t66*t67;
+        const double t69 = P00*P23 - P03*P20;
+        const double t70 = P01*P23 - P03*P21;
+        const double t71 = P02*P23 - P03*P22;
+        const double t72 = t5*t63 + t6*t64 + t63*t69 + t64*t70 + t66*t7 + t66*t71;
+        const double t73 = P03*P10 - P00*P13;
+        const double t74 = P03*P11 - P01*P13;
+        const double t75 = P03*P12 - P02*P13;
+        const double t76 = t10*t64 + t11*t66 + t63*t73 + t63*t9 + t64*t74 + t66*t75;
+        const double across_sum01 = -sum0*t35;
+        const double t77 = 0.5*across_sum01;
+        const double across_sum11 = t33 - sum1*sum1*t34;
+        const double t78 = 0.5*across_sum11;
+        const double across_sum21 = -sum1;
+        const double t79 = 0.5*across_sum21;
+        const double t80 = t0*t77 + t1*t78 + t2*t79 + t62*t77 + t65*t78 + t67*t79;
+        const double t81 = t5*t77 + t6*t78 + t69*t77 + t7*t79 + t70*t78 + t71*t79;
+        const double t82 = t10*t78 + t11*t79 + t73*t77 + t74*t78 + t75*t79 + t77*t9;
+        const double t29 = nx - vx;
+        const double t30 = ny - vy;
+        const double t31 = nz - vz;
+        const double t32 = 1.0/sqrt(t29*t29 + t30*t30 + t31*t31);
+        const double rest0 = t29*t32;
+        const double rest2 = t31*t32;
+        const double t37 = (rest2 > 0.0 ? 1.0 : -1.0);
+        const double t38 = 1.0/(rest2 + t37);
+        const double across_rest00 = 1.0 - rest0*rest0*t37*t38;
+        const double rest1 = t30*t32;
+        const double t39 = rest1*t38;
+        const double t40 = rest0*t37;
+        const double across_rest10 = -t39*t40;
+        const double across_rest20 = -t40;
+        const double t83 = 0.5*across_rest00;
+        const double t84 = 0.5*across_rest10;
+        const double t85 = 0.5*across_rest20;
+        const double t86 = 0.5*across_rest00*t0 + 0.5*across_rest10*t1 + 0.5*across_rest20*t2 - t62*t83 - t65*t84 - t67*t85;
+        const double t87 = 0.5*across_rest00*t5 + 0.5*across_rest10*t6 + 0.5*across_rest20*t7 - t69*t83 - t70*t84 - t71*t85;
+        const double t88 = 0.5*across_rest00*t9 + 0.5*across_rest10*t10 + 0.5*across_rest20*t11 - t73*t83 - t74*t84 - t75*t85;
+        const double across_rest01 = -rest0*t39;
+        const double across_rest11 = t37 - rest1*rest1*t38;
+        const double across_rest21 = -rest1;
+        const double t89 = 0.5*across_rest01;
+        const double t90 = 0.5*across_rest11;
+        const double t91 = 0.5*across_rest21;
+        const double t92 = 0.5*across_rest01*t0 + 0.5*across_rest11*t1 + 0.5*across_rest21*t2 - t62*t89 - t65*t90 - t67*t91;
+        const double t93 = 0.5*across_rest01*t5 + 0.5*across_rest11*t6 + 0.5*across_rest21*t7 - t69*t89 - t70*t90 - t71*t91;
+        const double t94 = 0.5*across_rest01*t9 + 0.5*across_rest11*t10 + 0.5*across_rest21*t11 - t73*t89 - t74*t90 - t75*t91;
+        r[i] = t17*t18;
+        r[n + i] = t22*t23;
+        J_camera[i] = -slope01*t41 - slope02*t43;
+        J_camera[n + i] = -slope01*t44 - slope02*t46;
+        J_camera[2*n + i] = -slope01*t47 - slope02*t49;
+        J_camera[3*n + i] = -slope01*t50 - slope02*t4;
+        J_camera[4*n + i] = -slope00*t52 - slope02*t51;
+        J_camera[5*n + i] = -slope00*t54 - slope02*t53;
+        J_camera[6*n + i] = -slope00*t56 - slope02*t55;
+        J_camera[7*n + i] = -slope00*t3 - slope02*t57;
+        J_camera[8*n + i] = -slope00*t42 - slope01*t58;
+        J_camera[9*n + i] = -slope00*t45 - slope01*t59;
+        J_camera[10*n + i] = -slope00*t48 - slope01*t60;
+        J_camera[11*n + i] = -slope00*t61 - slope01*t8;
+        J_camera[12*n + i] = -slope11*t41 - slope12*t43;
+        J_camera[13*n + i] = -slope11*t44 - slope12*t46;
+        J_camera[14*n + i] = -slope11*t47 - slope12*t49;
+        J_camera[15*n + i] = -slope11*t50 - slope12*t4;
+        J_camera[16*n + i] = -slope10*t52 - slope12*t51;
+        J_camera[17*n + i] = -slope10*t54 - slope12*t53;
+        J_camera[18*n + i] = -slope10*t56 - slope12*t55;
+        J_camera[19*n + i] = -slope10*t3 - slope12*t57;
+        J_camera[20*n + i] = -slope10*t42 - slope11*t58;
+        J_camera[21*n + i] = -slope10*t45 - slope11*t59;
+        J_camera[22*n + i] = -slope10*t48 - slope11*t60;
+        J_camera[23*n + i] = -slope10*t61 - slope11*t8;
+        J_line[i] = -slope00*t68 - slope01*t72 - slope02*t76;
+        J_line[n + i] = -slope00*t80 - slope01*t81 - slope02*t82;
+        J_line[2*n + i] = -slope00*t86 - slope01*t87 - slope02*t88;
+        J_line[3*n + i] = -slope00*t92 - slope01*t93 - slope02*t94;
+        J_line[4*n + i] = -slope10*t68 - slope11*t72 - slope12*t76;
+        J_line[5*n + i] = -slope10*t80 - slope11*t81 - slope12*t82;
+        J_line[6*n + i] = -slope10*t86 - slope11*t87 - slope12*t88;
+        J_line[7*n + i] = -slope10*t92 - slope11*t93 - slope12*t94;
     }
 }
 

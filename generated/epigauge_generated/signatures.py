@@ -1057,6 +1057,30 @@ SIGNATURES = {
         (Argument("N", (4, 7), True), ),
         "updates of a line by the gauge of poses: rotation x, rotation y, rotation z, translation x, translation y, translation z, scale.",
     ),
+    "line_transform": Signature(
+        "lines",
+        (Argument("T", (4, 4), True), Argument("line", (6,), True), ),
+        (Argument("moved", (6,), True), ),
+        "line (n, v) where points X are moved to T X: the exterior square of T times it.",
+    ),
+    "projective_line_retract": Signature(
+        "lines",
+        (Argument("line", (6,), True), Argument("delta", (4,), True), ),
+        (Argument("moved", (6,), True), ),
+        "line of length one, moved by turning the directions n + v and n - v by two numbers each: the orthonormal representation (Bartoli & Sturm, CVIU 2005) in four dimensions.",
+    ),
+    "projective_line_tangent": Signature(
+        "lines",
+        (Argument("line", (6,), True), ),
+        (Argument("T", (6, 4), True), ),
+        "derivative of the line of length one by that update, at none.",
+    ),
+    "projective_line_generators": Signature(
+        "lines",
+        (Argument("line", (6,), True), ),
+        (Argument("N", (4, 15), True), ),
+        "updates of a line of length one by the gauge of projective cameras: translation x, translation y, translation z, E01, E02, E10, E11-E00, E12, E20, E21, E22-E00, E30, E31, E32, E33-E00.",
+    ),
     "pinhole_line_residual": Signature(
         "lines",
         (Argument("camera", (16,), True), Argument("line", (6,), True), Argument("segment", (4,), True), Argument("spread", (6,), True), ),
@@ -1068,6 +1092,18 @@ SIGNATURES = {
         (Argument("camera", (16,), True), Argument("line", (6,), True), Argument("origin", (3,), True), Argument("segment", (4,), True), Argument("spread", (6,), True), ),
         (Argument("r", (2,), True), Argument("J_camera", (2, 10), True), Argument("J_line", (2, 4), True), ),
         "pinhole_line_residual, and minus its derivatives by the update of the camera (wx, wy, wz, dx, dy, dz, fx, fy, cx, cy) and by that of the line about an origin.",
+    ),
+    "projective_line_residual": Signature(
+        "lines",
+        (Argument("camera", (12,), True), Argument("line", (6,), True), Argument("segment", (4,), True), Argument("spread", (6,), True), ),
+        (Argument("r", (2,), True), ),
+        "signed distances of both end points of a segment to the image of a line in the camera projective, over their standard deviations.",
+    ),
+    "projective_line_observe": Signature(
+        "lines",
+        (Argument("camera", (12,), True), Argument("line", (6,), True), Argument("segment", (4,), True), Argument("spread", (6,), True), ),
+        (Argument("r", (2,), True), Argument("J_camera", (2, 12), True), Argument("J_line", (2, 4), True), ),
+        "projective_line_residual, and minus its derivatives by the update of the camera (dP00, dP01, dP02, dP03, dP10, dP11, dP12, dP13, dP20, dP21, dP22, dP23) and by that of the line in four dimensions.",
     ),
     "simple_pinhole_line_residual": Signature(
         "lines",

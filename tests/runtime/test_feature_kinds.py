@@ -11,7 +11,7 @@ from epigauge.bundle import native_linearizer, numpy_linearizer
 from epigauge.bundle.dampings import Covariant, Marquardt
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.kernels import table
-from epigauge.multi_view.line_adjust import line_job
+from epigauge.multi_view.line_adjust import line_problem
 
 BACKENDS = [
     pytest.param(name, marks=[] if why is None else pytest.mark.skip(why))
@@ -34,7 +34,7 @@ def seen_by(n_views, window, step=1):
 
 
 def linearized(tracks, lines, start, backend, **options):
-    job, _ = line_job(tracks, start, lines, table(backend), **options)
+    job = line_problem(tracks, start, lines, table(backend), **options)
     return job, job.problem.linearize(job.problem.evaluate(job.start))
 
 

@@ -7,11 +7,11 @@ from typing import Any
 import epigauge as eg
 import numpy as np
 import pytest
-from epigauge.bundle.lines import LineLinearizer, unit_lines
+from epigauge.bundle.lines import LineLinearizer
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.kernels import table
-from epigauge.multi_view.line_adjust import line_job
+from epigauge.multi_view.line_adjust import line_problem
 from epigauge.two_view.losses import Loss
 from numpy.typing import NDArray
 
@@ -45,7 +45,7 @@ def test_blocks_are_those_of_a_dense_inverse(
     scene: eg.LineScene, found: eg.MetricReconstruction, cov: eg.MetricCovariance
 ) -> None:
     tracks, lines = scene.tracks, scene.line_tracks
-    made = line_job(tracks, found, lines, table(), refine="pose")[0]
+    made = line_problem(tracks, found, lines, table(), refine="pose")
     at, job = made.start, made.job
     graph = ObservationGraph(tracks.view, tracks.point, 5, 12)
     parts = job.model, table(), graph, job.q, np.ones(60), Loss()
@@ -84,7 +84,7 @@ def test_blocks_are_those_of_a_dense_inverse(
         steps = np.zeros((8, 4))
         steps[k] = step
         moved = kind.moved(at.cameras, at.others[0], steps)
-        return unit_lines(home.lines(moved))[k]
+        return kind.carried(home, moved)[k]
 
     D = slope(line, 4)
     of_point = home.scale * home.rotation

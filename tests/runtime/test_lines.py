@@ -14,7 +14,7 @@ from epigauge.bundle.problem import Estimate
 from epigauge.bundle.similarity import Similarity
 from epigauge.cameras import camera_model
 from epigauge.kernels import table
-from epigauge.multi_view.line_adjust import line_job
+from epigauge.multi_view.line_adjust import line_problem
 
 
 def off(found, wanted):
@@ -96,7 +96,7 @@ def test_steps_are_the_same_in_twenty_frames():
             lines = there.lines(scene.true.lines)
             parts = scene.true.cameras, lines
             start = eg.MetricReconstruction(pose[:, :, :3], pose[:, :, 3], X, *parts)
-        made, _ = line_job(scene.tracks, start, scene.line_tracks, table())
+        made = line_problem(scene.tracks, start, scene.line_tracks, table(), embedded=True)
         problem, begin = made.problem, made.start
         if there is not None:  # in that very frame, not in the one that suits best
             begin = Estimate(start.vectors, start.X, others=(start.lines,))
@@ -217,14 +217,14 @@ def test_what_lines_do_not_go_with_is_refused(scene):
     lines = scene.line_tracks
     for options, name in (
         ({"robust": True}, "robust"),
-        ({"gauge": eg.gauge.identity()}, "gauge"),
+        ({"gauge": eg.gauge.identity(), "gauge_mode": "implicit"}, "gauge_mode"),
         ({"method": "free"}, "method"),
         ({"noise_px": None, "priors": [eg.PositionPrior(0, [0, 0, 0], 1.0)]}, "noise_px"),
     ):
         with pytest.raises(eg.ArgumentError, match=name):
             eg.bundle_adjust(scene.tracks, scene.true, lines=lines, **options)
     with pytest.raises(eg.ArgumentError, match="MetricReconstruction"):
-        eg.bundle_adjust(scene.tracks, scene.true.to_projective(), lines=lines)
+        eg.bundle_adjust(scene.tracks, scene.true.R, lines=lines)
     with pytest.raises(eg.ArgumentError, match="LineTracks"):
         eg.bundle_adjust(scene.tracks, scene.true, lines=scene.tracks)
     parts = scene.true.R, scene.true.t, scene.true.X, scene.true.cameras
@@ -305,8 +305,8 @@ def test_the_command_line_does_not_lose_lines(tmp_path, scene, run):
 
 def test_a_start_that_is_none_and_odd_numbers_of_lines_are_named(scene):
     lines = scene.line_tracks
-    with pytest.raises(eg.ArgumentError, match="start is a NoneType"):
-        eg.bundle_adjust(scene.tracks, lines=lines)
+    with pytest.raises(eg.ArgumentError, match="start is a str"):
+        eg.bundle_adjust(scene.tracks, "scene", lines=lines)
     parts = lines.view, lines.line, lines.segments
     for bad in (59.5, "60", np.nan, [60, 61], True, 0):
         with pytest.raises(eg.ArgumentError, match="n_lines"):

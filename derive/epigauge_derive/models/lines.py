@@ -7,6 +7,12 @@ of space this has rank three for lines through it, and depends on the frame. Her
 about another origin, a place that goes along with the scene and off the line, with the distance
 of the line from there for unit of length: W is then a rotation by 45 degrees, the rank is four,
 and the update means the same in all frames that a similarity changes into one another.
+
+A projective basis has no such places. There U and W are those of four dimensions: a rotation of the
+four homogeneous coordinates is a pair of rotations, of n + v and of n - v, which are equally long
+as n and v are orthogonal. Each of these two directions is turned by two numbers. The rank is four
+for every line, through the origin or infinitely far, and orthonormal changes of basis change
+nothing.
 """
 
 from __future__ import annotations
@@ -15,7 +21,7 @@ import sympy as sp
 
 from epigauge_derive.camera_model import POSE, CameraModel, H, camera_models
 from epigauge_derive.gauge import gauge
-from epigauge_derive.kernel import Input, Kernel, Let, Output, at, cross, jacobian
+from epigauge_derive.kernel import Input, Kernel, Let, Output, at, cross, jacobian, select
 from epigauge_derive.models.rotations import euler_rotation
 
 LINE = Input("line", (6,), names=("nx", "ny", "nz", "vx", "vy", "vz"))
@@ -30,6 +36,11 @@ _SEEN = sp.symbols("seen0:3", real=True)
 _IMAGE = sp.symbols("image0:3", real=True)
 _MOMENT = sp.symbols("moment0:3", real=True)
 _DISTANCE, _LENGTH = sp.symbols("distance length", positive=True)
+#: The directions n + v and n - v, and two axes across each of them.
+_SIDES = tuple(sp.Matrix(sp.symbols(f"{name}0:3", real=True)) for name in ("sum", "rest"))
+_AXES = tuple(
+    sp.Matrix(3, 2, sp.symbols(f"across_{name}0:3(0:2)", real=True)) for name in ("sum", "rest")
+)
 
 
 def seen(M: sp.Matrix, n: sp.Matrix, v: sp.Matrix) -> sp.Matrix:
@@ -141,12 +152,51 @@ def _coordinates(velocity: sp.Matrix) -> sp.Matrix:
     return sp.diag(1, 1, sp.S.Half, sp.S.Half) * (near * tangent()).T * near * velocity
 
 
+def carried(T: sp.Matrix, n: sp.Matrix, v: sp.Matrix) -> sp.Matrix:
+    """Return the line where points X are moved to T X: the exterior square of T, by (n, v).
+
+    A line through A and B is the matrix A B^T - B A^T = -([n] v; -v^T 0), which T L T^T moves.
+    """
+    L = cross(list(n)).row_join(v).col_join((-v.T).row_join(sp.zeros(1, 1)))
+    moved = T * L * T.T
+    return sp.Matrix([moved[2, 1], moved[0, 2], moved[1, 0], *moved[:3, 3]])
+
+
 def _velocity(B: sp.Matrix) -> sp.Matrix:
-    """Return how the line moves with points that move by B X, the last row of B being zero."""
+    """Return how the line moves with points that move by B X."""
+    epsilon = sp.Symbol("epsilon")
+    both = carried(sp.eye(4) + epsilon * B, *_halves(LINE.matrix()))
+    return at(both.diff(epsilon), {epsilon: sp.S.Zero}).expand()
+
+
+def _sides() -> tuple[Let, ...]:
+    """Name the directions n + v and n - v, then axes that are orthonormal with each."""
     n, v = _halves(LINE.matrix())
-    moved = sp.eye(4) + sp.Symbol("epsilon") * B
-    both = seen(moved[:3, :], n, v).col_join(moved[:3, :3] * v)
-    return at(both.diff(sp.Symbol("epsilon")), {sp.Symbol("epsilon"): sp.S.Zero})
+    first: dict[sp.Symbol, sp.Expr] = {}
+    then: dict[sp.Symbol, sp.Expr] = {}
+    for side, axes, whole in zip(_SIDES, _AXES, (n + v, n - v), strict=True):
+        first.update(zip(side, whole / sp.sqrt(sum(entry**2 for entry in whole)), strict=True))
+        x, y, z = side
+        sign = select(z, sp.S.One, sp.S.NegativeOne)
+        a = -1 / (sign + z)
+        one = sp.Matrix([1 + sign * x**2 * a, sign * x * y * a, -sign * x])
+        two = sp.Matrix([x * y * a, sign + y**2 * a, -y])
+        then.update(zip(axes, one.row_join(two), strict=True))
+    return Let(first), Let(then)
+
+
+def _turned(delta: list[sp.Symbol]) -> sp.Matrix:
+    """Return the line, of length one, after both directions are turned by two numbers each."""
+    sides = []
+    for side, axes, own in zip(_SIDES, _AXES, (delta[:2], delta[2:]), strict=True):
+        sides.append((side + axes * sp.Matrix(own)) / sp.sqrt(1 + own[0] ** 2 + own[1] ** 2))
+    return ((sides[0] + sides[1]) / 2).col_join((sides[0] - sides[1]) / 2)
+
+
+def turned_tangent() -> sp.Matrix:
+    """Return the derivative of the line of length one by that update, 6x4."""
+    delta = DELTA.entries()
+    return at(jacobian(list(_turned(delta)), delta), dict.fromkeys(delta, sp.S.Zero))
 
 
 def _distances(model: CameraModel) -> list[sp.Expr]:
@@ -175,8 +225,11 @@ def _calibration(model: CameraModel) -> sp.Matrix:
 
 
 def straight(model: CameraModel) -> bool:
-    """Tell whether a camera maps lines to lines: a pose, and an image that is linear in h0, h1."""
-    if model.frame is not POSE or model.corrects:
+    """Tell whether a camera maps lines to lines: its image is linear in h0, h1 where h2 is one.
+
+    Of cameras that are a pose, or any matrix.
+    """
+    if not (model.frame is POSE or model.point_size == 4) or model.corrects:
         return False
     h = H.entries()
     image = model.image(sp.Matrix([h[0], h[1], 1]), model.intrinsics().entries())
@@ -185,16 +238,12 @@ def straight(model: CameraModel) -> bool:
     return not any(slope.has(*h[:2]) for slope in slopes)
 
 
-def _of_camera(model: CameraModel) -> list[Kernel]:
-    """Return residual and Jacobians of a segment in a camera that maps lines to lines."""
-    camera, _ = model.inputs()
+def _velocities(model: CameraModel) -> tuple[sp.Matrix, dict[sp.Symbol, sp.Expr]]:
+    """Return the derivative of the seen line by the update of a camera, and what it names."""
     n, v = _halves(LINE.matrix())
     M = model.matrix()
-    stage = Let(dict(zip(_SEEN, _rigid(M, n, v), strict=True)))
-    distances = _distances(model)
-    by_seen = jacobian(distances, _SEEN)
-    slopes = sp.Matrix(2, 3, lambda i, j: sp.Symbol(f"slope{i}{j}", real=True))
-    named = Let(dict(zip(slopes, by_seen, strict=True)))
+    if model.frame is not POSE:  # an additive update
+        return jacobian(list(seen(M, n, v)), list(M)), {}
     # An update of the camera moves what it sees, (seen, R v).
     delta = sp.symbols(f"delta0:{len(POSE.unknowns)}", real=True)
     zero = {symbol: value for symbol, (_, value) in POSE.even(delta).items()}
@@ -204,13 +253,31 @@ def _of_camera(model: CameraModel) -> list[Kernel]:
     turned = sp.Matrix(sp.symbols("turned0:3", real=True))
     moved = seen(E.row_join(f), sp.Matrix(_SEEN), turned)
     velocity = at(at(jacobian(list(moved), delta), dict.fromkeys(delta, sp.S.Zero)), zero)
-    directions = Let(dict(zip(turned, M[:, :3] * v, strict=True)))
+    return velocity, dict(zip(turned, M[:, :3] * v, strict=True))
+
+
+def _of_camera(model: CameraModel) -> list[Kernel]:
+    """Return residual and Jacobians of a segment in a camera that maps lines to lines."""
+    camera, _ = model.inputs()
+    n, v = _halves(LINE.matrix())
+    M = model.matrix()
+    pose = model.frame is POSE
+    image = _rigid if pose else seen
+    stage = Let(dict(zip(_SEEN, image(M, n, v), strict=True)))
+    distances = _distances(model)
+    by_seen = jacobian(distances, _SEEN)
+    slopes = sp.Matrix(2, 3, lambda i, j: sp.Symbol(f"slope{i}{j}", real=True))
+    named = Let(dict(zip(slopes, by_seen, strict=True)))
+    velocity, directions = _velocities(model)
     intrinsics = dict(zip(model.parameters, model.intrinsics().entries(), strict=True))
     by_k = jacobian(distances, [intrinsics[name] for name in model.adjusted])
-    by_line = _rigid(M, *_halves(sp.Matrix(sp.symbols("m0:6", real=True))))
-    by_line = jacobian(list(by_line), sp.symbols("m0:6", real=True)) * tangent()
+    own = -slopes * velocity
+    moving = sp.symbols("m0:6", real=True)
+    by_line = jacobian(list(image(M, *_halves(sp.Matrix(moving)))), moving)
+    by_line = by_line * (tangent() if pose else turned_tangent())
     r = Output.of("r", sp.Matrix(distances))
     inputs = SEGMENT, SPREAD
+    where = "about an origin" if pose else "in four dimensions"
     return [
         Kernel(
             f"{model.prefix}_line_residual",
@@ -223,14 +290,14 @@ def _of_camera(model: CameraModel) -> list[Kernel]:
         Kernel(
             f"{model.prefix}_line_observe",
             f"{model.prefix}_line_residual, and minus its derivatives by the update of the camera "
-            f"({', '.join(model.unknowns)}) and by that of the line about an origin.",
-            (camera, LINE, ORIGIN, *inputs),
+            f"({', '.join(model.unknowns)}) and by that of the line {where}.",
+            (camera, LINE, *((ORIGIN,) if pose else ()), *inputs),
             (
                 r,
-                Output.of("J_camera", -(slopes * velocity).row_join(by_k)),
+                Output.of("J_camera", own.row_join(-by_k) if by_k.cols else own),
                 Output.of("J_line", -slopes * by_line),
             ),
-            (stage, directions, named, _local()),
+            (stage, Let(directions), named, *((_local(),) if pose else _sides())),
         ),
     ]
 
@@ -246,8 +313,13 @@ def kernels() -> list[Kernel]:
     P = Input("P", (3, 4))
     n, v = _halves(LINE.matrix())
     models = [model for model in camera_models() if straight(model)]
-    fields = gauge(models[0])
-    velocities = sp.Matrix.hstack(*(_velocity(B) for _, B in fields))
+    pose, other = (
+        gauge(next(model for model in models if (model.frame is POSE) == rigid))
+        for rigid in (True, False)
+    )
+    velocities, others = (
+        sp.Matrix.hstack(*(_velocity(B) for _, B in fields)) for fields in (pose, other)
+    )
     return [
         Kernel(
             "line_project",
@@ -280,10 +352,40 @@ def kernels() -> list[Kernel]:
         *_measures(),
         Kernel(
             "line_generators",
-            f"updates of a line by the gauge of poses: {', '.join(name for name, _ in fields)}.",
+            f"updates of a line by the gauge of poses: {', '.join(name for name, _ in pose)}.",
             (LINE, ORIGIN),
             (Output.of("N", _coordinates(velocities)),),
             (_local(),),
+        ),
+        Kernel(
+            "line_transform",
+            "line (n, v) where points X are moved to T X: the exterior square of T times it.",
+            (Input("T", (4, 4)), LINE),
+            (Output.of("moved", carried(Input("T", (4, 4)).matrix(), n, v)),),
+        ),
+        Kernel(
+            "projective_line_retract",
+            "line of length one, moved by turning the directions n + v and n - v by two numbers "
+            "each: the orthonormal representation (Bartoli & Sturm, CVIU 2005) in four dimensions.",
+            (LINE, DELTA),
+            (Output.of("moved", _turned(DELTA.entries())),),
+            _sides(),
+        ),
+        Kernel(
+            "projective_line_tangent",
+            "derivative of the line of length one by that update, at none.",
+            (LINE,),
+            (Output.of("T", turned_tangent()),),
+            _sides(),
+        ),
+        Kernel(
+            "projective_line_generators",
+            "updates of a line of length one by the gauge of projective cameras: "
+            f"{', '.join(name for name, _ in other)}.",
+            (LINE,),
+            # The columns of the tangent are orthogonal to one another and to the line.
+            (Output.of("N", 2 * turned_tangent().T * others),),
+            _sides(),
         ),
         *(kernel for model in models for kernel in _of_camera(model)),
     ]

@@ -521,6 +521,418 @@ def line_generators():
 
 
 @cache
+def line_transform():
+    # Formula: line (n, v) where points X are moved to T X: the exterior square of T times it.
+    # Inputs:  T (4, 4), line (6,)
+    # Outputs: moved (6,)
+    # Operations: 102, temporaries: 12.
+    T = ca.SX.sym("T", 4, 4)
+    T00 = T[0, 0]
+    T01 = T[0, 1]
+    T02 = T[0, 2]
+    T03 = T[0, 3]
+    T10 = T[1, 0]
+    T11 = T[1, 1]
+    T12 = T[1, 2]
+    T13 = T[1, 3]
+    T20 = T[2, 0]
+    T21 = T[2, 1]
+    T22 = T[2, 2]
+    T23 = T[2, 3]
+    T30 = T[3, 0]
+    T31 = T[3, 1]
+    T32 = T[3, 2]
+    T33 = T[3, 3]
+    line = ca.SX.sym("line", 6, 1)
+    nx = line[0, 0]
+    ny = line[1, 0]
+    nz = line[2, 0]
+    vx = line[3, 0]
+    vy = line[4, 0]
+    vz = line[5, 0]
+    t0 = T20*vx + T21*vy + T22*vz
+    t1 = T21*nz - T22*ny - T23*vx
+    t2 = T22*nx - T20*nz - T23*vy
+    t3 = T20*ny - T21*nx - T23*vz
+    t4 = T00*vx + T01*vy + T02*vz
+    t5 = T01*nz - T02*ny - T03*vx
+    t6 = T02*nx - T00*nz - T03*vy
+    t7 = T00*ny - T01*nx - T03*vz
+    t10 = T12*nx - T10*nz - T13*vy
+    t11 = T10*ny - T11*nx - T13*vz
+    t8 = T10*vx + T11*vy + T12*vz
+    t9 = T11*nz - T12*ny - T13*vx
+    moved = ca.SX(6, 1)
+    moved[0, 0] = T10*t1 + T11*t2 + T12*t3 + T13*t0
+    moved[1, 0] = T20*t5 + T21*t6 + T22*t7 + T23*t4
+    moved[2, 0] = T00*t9 + T01*t10 + T02*t11 + T03*t8
+    moved[3, 0] = T30*t5 + T31*t6 + T32*t7 + T33*t4
+    moved[4, 0] = T30*t9 + T31*t10 + T32*t11 + T33*t8
+    moved[5, 0] = T30*t1 + T31*t2 + T32*t3 + T33*t0
+    return ca.Function(
+        "line_transform",
+        [T, line],
+        [moved],
+        ["T", "line"],
+        ["moved"],
+    )
+
+
+@cache
+def projective_line_retract():
+    # Formula: line of length one, moved by turning the directions n + v and n - v by two numbers
+    # each: the orthonormal representation (Bartoli & Sturm, CVIU 2005) in four dimensions.
+    # Inputs:  line (6,), delta (4,)
+    # Outputs: moved (6,)
+    # Operations: 124, temporaries: 43.
+    line = ca.SX.sym("line", 6, 1)
+    nx = line[0, 0]
+    ny = line[1, 0]
+    nz = line[2, 0]
+    vx = line[3, 0]
+    vy = line[4, 0]
+    vz = line[5, 0]
+    delta = ca.SX.sym("delta", 4, 1)
+    delta0 = delta[0, 0]
+    delta1 = delta[1, 0]
+    delta2 = delta[2, 0]
+    delta3 = delta[3, 0]
+    t0 = nx + vx
+    t1 = ny + vy
+    t2 = nz + vz
+    t3 = 1.0/ca.sqrt(t0*t0 + t1*t1 + t2*t2)
+    sum0 = t0*t3
+    sum2 = t2*t3
+    t8 = ca.if_else(sum2 > 0.0, 1.0, -1.0)
+    t9 = 1.0/(sum2 + t8)
+    across_sum00 = 1.0 - sum0*sum0*t8*t9
+    sum1 = t1*t3
+    t10 = sum1*t9
+    across_sum01 = -sum0*t10
+    t16 = sum0 + across_sum00*delta0 + across_sum01*delta1
+    t17 = 1.0/ca.sqrt(1.0 + delta0*delta0 + delta1*delta1)
+    t18 = 0.5*t17
+    t4 = nx - vx
+    t5 = ny - vy
+    t6 = nz - vz
+    t7 = 1.0/ca.sqrt(t4*t4 + t5*t5 + t6*t6)
+    rest0 = t4*t7
+    rest2 = t6*t7
+    t12 = ca.if_else(rest2 > 0.0, 1.0, -1.0)
+    t13 = 1.0/(rest2 + t12)
+    across_rest00 = 1.0 - rest0*rest0*t12*t13
+    rest1 = t5*t7
+    t14 = rest1*t13
+    across_rest01 = -rest0*t14
+    t19 = 0.5/ca.sqrt(1.0 + delta2*delta2 + delta3*delta3)
+    t20 = t19*(rest0 + across_rest00*delta2 + across_rest01*delta3)
+    t11 = sum0*t8
+    across_sum10 = -t10*t11
+    across_sum11 = t8 - sum1*sum1*t9
+    t21 = sum1 + across_sum10*delta0 + across_sum11*delta1
+    t15 = rest0*t12
+    across_rest10 = -t14*t15
+    across_rest11 = t12 - rest1*rest1*t13
+    t22 = t19*(rest1 + across_rest10*delta2 + across_rest11*delta3)
+    across_sum20 = -t11
+    across_sum21 = -sum1
+    t23 = sum2 + across_sum20*delta0 + across_sum21*delta1
+    across_rest20 = -t15
+    across_rest21 = -rest1
+    t24 = t19*(rest2 + across_rest20*delta2 + across_rest21*delta3)
+    moved = ca.SX(6, 1)
+    moved[0, 0] = t20 + t16*t18
+    moved[1, 0] = t22 + t18*t21
+    moved[2, 0] = t24 + t18*t23
+    moved[3, 0] = 0.5*t16*t17 - t20
+    moved[4, 0] = 0.5*t17*t21 - t22
+    moved[5, 0] = 0.5*t17*t23 - t24
+    return ca.Function(
+        "projective_line_retract",
+        [line, delta],
+        [moved],
+        ["line", "delta"],
+        ["moved"],
+    )
+
+
+@cache
+def projective_line_tangent():
+    # Formula: derivative of the line of length one by that update, at none.
+    # Inputs:  line (6,)
+    # Outputs: T (6, 4)
+    # Operations: 84, temporaries: 46.
+    line = ca.SX.sym("line", 6, 1)
+    nx = line[0, 0]
+    ny = line[1, 0]
+    nz = line[2, 0]
+    vx = line[3, 0]
+    vy = line[4, 0]
+    vz = line[5, 0]
+    t0 = nx + vx
+    t1 = ny + vy
+    t2 = nz + vz
+    t3 = 1.0/ca.sqrt(t0*t0 + t1*t1 + t2*t2)
+    sum0 = t0*t3
+    sum2 = t2*t3
+    t8 = ca.if_else(sum2 > 0.0, 1.0, -1.0)
+    t9 = 1.0/(sum2 + t8)
+    across_sum00 = 1.0 - sum0*sum0*t8*t9
+    t16 = 0.5*across_sum00
+    sum1 = t1*t3
+    t10 = sum1*t9
+    across_sum01 = -sum0*t10
+    t17 = 0.5*across_sum01
+    t4 = nx - vx
+    t5 = ny - vy
+    t6 = nz - vz
+    t7 = 1.0/ca.sqrt(t4*t4 + t5*t5 + t6*t6)
+    rest0 = t4*t7
+    rest2 = t6*t7
+    t12 = ca.if_else(rest2 > 0.0, 1.0, -1.0)
+    t13 = 1.0/(rest2 + t12)
+    across_rest00 = 1.0 - rest0*rest0*t12*t13
+    t18 = 0.5*across_rest00
+    rest1 = t5*t7
+    t14 = rest1*t13
+    across_rest01 = -rest0*t14
+    t19 = 0.5*across_rest01
+    t11 = sum0*t8
+    across_sum10 = -t10*t11
+    t20 = 0.5*across_sum10
+    across_sum11 = t8 - sum1*sum1*t9
+    t21 = 0.5*across_sum11
+    t15 = rest0*t12
+    across_rest10 = -t14*t15
+    t22 = 0.5*across_rest10
+    across_rest11 = t12 - rest1*rest1*t13
+    t23 = 0.5*across_rest11
+    across_sum20 = -t11
+    t24 = 0.5*across_sum20
+    across_sum21 = -sum1
+    t25 = 0.5*across_sum21
+    across_rest20 = -t15
+    t26 = 0.5*across_rest20
+    across_rest21 = -rest1
+    t27 = 0.5*across_rest21
+    T = ca.SX(6, 4)
+    T[0, 0] = t16
+    T[0, 1] = t17
+    T[0, 2] = t18
+    T[0, 3] = t19
+    T[1, 0] = t20
+    T[1, 1] = t21
+    T[1, 2] = t22
+    T[1, 3] = t23
+    T[2, 0] = t24
+    T[2, 1] = t25
+    T[2, 2] = t26
+    T[2, 3] = t27
+    T[3, 0] = t16
+    T[3, 1] = t17
+    T[3, 2] = -t18
+    T[3, 3] = -t19
+    T[4, 0] = t20
+    T[4, 1] = t21
+    T[4, 2] = -t22
+    T[4, 3] = -t23
+    T[5, 0] = t24
+    T[5, 1] = t25
+    T[5, 2] = -t26
+    T[5, 3] = -t27
+    return ca.Function(
+        "projective_line_tangent",
+        [line],
+        [T],
+        ["line"],
+        ["T"],
+    )
+
+
+@cache
+def projective_line_generators():
+    # Formula: updates of a line of length one by the gauge of projective cameras: translation x,
+    # translation y, translation z, E01, E02, E10, E11-E00, E12, E20, E21, E22-E00, E30, E31,
+    # E32, E33-E00.
+    # Inputs:  line (6,)
+    # Outputs: N (4, 15)
+    # Operations: 260, temporaries: 98.
+    line = ca.SX.sym("line", 6, 1)
+    nx = line[0, 0]
+    ny = line[1, 0]
+    nz = line[2, 0]
+    vx = line[3, 0]
+    vy = line[4, 0]
+    vz = line[5, 0]
+    t1 = ny + vy
+    t0 = nx + vx
+    t2 = nz + vz
+    t3 = 1.0/ca.sqrt(t0*t0 + t1*t1 + t2*t2)
+    sum1 = t1*t3
+    sum2 = t2*t3
+    t8 = ca.if_else(sum2 > 0.0, 1.0, -1.0)
+    t9 = 1.0/(sum2 + t8)
+    t10 = sum1*t9
+    sum0 = t0*t3
+    t11 = sum0*t8
+    across_sum10 = -t10*t11
+    t16 = across_sum10*vz
+    across_sum20 = -t11
+    t17 = -across_sum20*vy
+    across_sum00 = 1.0 - sum0*sum0*t8*t9
+    t18 = across_sum00*vz
+    t19 = -across_sum20*vx
+    t20 = across_sum00*vy
+    t21 = -across_sum10*vx
+    t22 = -across_sum10*nx
+    t23 = -across_sum20*nx
+    t24 = across_sum00*ny
+    t25 = across_sum10*ny
+    t26 = across_sum00*nx - across_sum00*vx
+    t27 = -across_sum20*ny
+    t28 = across_sum00*nz
+    t29 = across_sum10*nz
+    t30 = across_sum20*nz
+    across_sum11 = t8 - sum1*sum1*t9
+    t31 = across_sum11*vz
+    across_sum21 = -sum1
+    t32 = -across_sum21*vy
+    across_sum01 = -sum0*t10
+    t33 = across_sum01*vz
+    t34 = -across_sum21*vx
+    t35 = across_sum01*vy
+    t36 = -across_sum11*vx
+    t37 = -across_sum11*nx
+    t38 = -across_sum21*nx
+    t39 = across_sum01*ny
+    t40 = across_sum11*ny
+    t41 = across_sum01*nx - across_sum01*vx
+    t42 = -across_sum21*ny
+    t43 = across_sum01*nz
+    t44 = across_sum11*nz
+    t45 = across_sum21*nz
+    t5 = ny - vy
+    t4 = nx - vx
+    t6 = nz - vz
+    t7 = 1.0/ca.sqrt(t4*t4 + t5*t5 + t6*t6)
+    rest1 = t5*t7
+    rest2 = t6*t7
+    t12 = ca.if_else(rest2 > 0.0, 1.0, -1.0)
+    t13 = 1.0/(rest2 + t12)
+    t14 = rest1*t13
+    rest0 = t4*t7
+    t15 = rest0*t12
+    across_rest10 = -t14*t15
+    t46 = across_rest10*vz
+    across_rest20 = -t15
+    t47 = across_rest20*vy
+    across_rest00 = 1.0 - rest0*rest0*t12*t13
+    t48 = across_rest00*vz
+    t49 = across_rest20*vx
+    t50 = across_rest00*vy
+    t51 = across_rest10*vx
+    t52 = across_rest10*nx
+    t53 = across_rest20*nx
+    t54 = across_rest00*ny
+    t55 = across_rest10*ny
+    t56 = across_rest10*vy
+    t57 = across_rest00*nx + across_rest00*vx
+    t58 = across_rest20*ny
+    t59 = across_rest00*nz
+    t60 = across_rest10*nz
+    t61 = across_rest20*nz
+    t62 = across_rest20*vz
+    across_rest11 = t12 - rest1*rest1*t13
+    t63 = across_rest11*vz
+    across_rest21 = -rest1
+    t64 = across_rest21*vy
+    across_rest01 = -rest0*t14
+    t65 = across_rest01*vz
+    t66 = across_rest21*vx
+    t67 = across_rest01*vy
+    t68 = across_rest11*vx
+    t69 = across_rest11*nx
+    t70 = across_rest21*nx
+    t71 = across_rest01*ny
+    t72 = across_rest11*ny
+    t73 = across_rest11*vy
+    t74 = across_rest01*nx + across_rest01*vx
+    t75 = across_rest21*ny
+    t76 = across_rest01*nz
+    t77 = across_rest11*nz
+    t78 = across_rest21*nz
+    t79 = across_rest21*vz
+    N = ca.SX(4, 15)
+    N[0, 0] = -t16 - t17
+    N[0, 1] = t18 + t19
+    N[0, 2] = -t20 - t21
+    N[0, 3] = t20 + t22
+    N[0, 4] = t18 + t23
+    N[0, 5] = -t21 - t24
+    N[0, 6] = t26 + across_sum10*vy - t25
+    N[0, 7] = t16 + t27
+    N[0, 8] = -t19 - t28
+    N[0, 9] = -t17 - t29
+    N[0, 10] = t26 + across_sum20*vz - t30
+    N[0, 11] = t27 + t29
+    N[0, 12] = -t23 - t28
+    N[0, 13] = t22 + t24
+    N[0, 14] = across_sum10*vy + across_sum20*vz - t25 - t30
+    N[1, 0] = -t31 - t32
+    N[1, 1] = t33 + t34
+    N[1, 2] = -t35 - t36
+    N[1, 3] = t35 + t37
+    N[1, 4] = t33 + t38
+    N[1, 5] = -t36 - t39
+    N[1, 6] = t41 + across_sum11*vy - t40
+    N[1, 7] = t31 + t42
+    N[1, 8] = -t34 - t43
+    N[1, 9] = -t32 - t44
+    N[1, 10] = t41 + across_sum21*vz - t45
+    N[1, 11] = t42 + t44
+    N[1, 12] = -t38 - t43
+    N[1, 13] = t37 + t39
+    N[1, 14] = across_sum11*vy + across_sum21*vz - t40 - t45
+    N[2, 0] = t47 - t46
+    N[2, 1] = t48 - t49
+    N[2, 2] = t51 - t50
+    N[2, 3] = -t50 - t52
+    N[2, 4] = -t48 - t53
+    N[2, 5] = -t51 - t54
+    N[2, 6] = t57 - t55 - t56
+    N[2, 7] = -t46 - t58
+    N[2, 8] = -t49 - t59
+    N[2, 9] = -t47 - t60
+    N[2, 10] = t57 - t61 - t62
+    N[2, 11] = t58 - t60
+    N[2, 12] = t59 - t53
+    N[2, 13] = t52 - t54
+    N[2, 14] = -t55 - t56 - t61 - t62
+    N[3, 0] = t64 - t63
+    N[3, 1] = t65 - t66
+    N[3, 2] = t68 - t67
+    N[3, 3] = -t67 - t69
+    N[3, 4] = -t65 - t70
+    N[3, 5] = -t68 - t71
+    N[3, 6] = t74 - t72 - t73
+    N[3, 7] = -t63 - t75
+    N[3, 8] = -t66 - t76
+    N[3, 9] = -t64 - t77
+    N[3, 10] = t74 - t78 - t79
+    N[3, 11] = t75 - t77
+    N[3, 12] = t76 - t70
+    N[3, 13] = t69 - t71
+    N[3, 14] = -t72 - t73 - t78 - t79
+    return ca.Function(
+        "projective_line_generators",
+        [line],
+        [N],
+        ["line"],
+        ["N"],
+    )
+
+
+@cache
 def pinhole_line_residual():
     # Formula: signed distances of both end points of a segment to the image of a line in the
     # camera PINHOLE, over their standard deviations.
@@ -780,6 +1192,274 @@ def pinhole_line_observe():
         [camera, line, origin, segment, spread],
         [r, J_camera, J_line],
         ["camera", "line", "origin", "segment", "spread"],
+        ["r", "J_camera", "J_line"],
+    )
+
+
+@cache
+def projective_line_residual():
+    # Formula: signed distances of both end points of a segment to the image of a line in the
+    # camera projective, over their standard deviations.
+    # Inputs:  camera (12,), line (6,), segment (4,), spread (6,)
+    # Outputs: r (2,)
+    # Operations: 97, temporaries: 9.
+    camera = ca.SX.sym("camera", 12, 1)
+    P00 = camera[0, 0]
+    P01 = camera[1, 0]
+    P02 = camera[2, 0]
+    P03 = camera[3, 0]
+    P10 = camera[4, 0]
+    P11 = camera[5, 0]
+    P12 = camera[6, 0]
+    P13 = camera[7, 0]
+    P20 = camera[8, 0]
+    P21 = camera[9, 0]
+    P22 = camera[10, 0]
+    P23 = camera[11, 0]
+    line = ca.SX.sym("line", 6, 1)
+    nx = line[0, 0]
+    ny = line[1, 0]
+    nz = line[2, 0]
+    vx = line[3, 0]
+    vy = line[4, 0]
+    vz = line[5, 0]
+    segment = ca.SX.sym("segment", 4, 1)
+    x1 = segment[0, 0]
+    y1 = segment[1, 0]
+    x2 = segment[2, 0]
+    y2 = segment[3, 0]
+    spread = ca.SX.sym("spread", 6, 1)
+    xx1 = spread[0, 0]
+    xy1 = spread[1, 0]
+    yy1 = spread[2, 0]
+    xx2 = spread[3, 0]
+    xy2 = spread[4, 0]
+    yy2 = spread[5, 0]
+    t0 = P20*vx + P21*vy + P22*vz
+    t1 = P10*vx + P11*vy + P12*vz
+    seen0 = P13*t0 + nx*(P11*P22 - P12*P21) + ny*(P12*P20 - P10*P22) + nz*(P10*P21 - P11*P20) - P23*t1
+    t2 = P00*vx + P01*vy + P02*vz
+    seen1 = P23*t2 + nx*(P02*P21 - P01*P22) + ny*(P00*P22 - P02*P20) + nz*(P01*P20 - P00*P21) - P03*t0
+    seen2 = P03*t1 + nx*(P01*P12 - P02*P11) + ny*(P02*P10 - P00*P12) + nz*(P00*P11 - P01*P10) - P13*t2
+    t3 = seen0*seen0
+    t4 = seen1*seen1
+    t5 = 2.0*seen0*seen1
+    r = ca.SX(2, 1)
+    r[0, 0] = (seen2 + seen0*x1 + seen1*y1)/ca.sqrt(t3*xx1 + t4*yy1 + t5*xy1)
+    r[1, 0] = (seen2 + seen0*x2 + seen1*y2)/ca.sqrt(t3*xx2 + t4*yy2 + t5*xy2)
+    return ca.Function(
+        "projective_line_residual",
+        [camera, line, segment, spread],
+        [r],
+        ["camera", "line", "segment", "spread"],
+        ["r"],
+    )
+
+
+@cache
+def projective_line_observe():
+    # Formula: projective_line_residual, and minus its derivatives by the update of the camera
+    # (dP00, dP01, dP02, dP03, dP10, dP11, dP12, dP13, dP20, dP21, dP22, dP23) and by that of the
+    # line in four dimensions.
+    # Inputs:  camera (12,), line (6,), segment (4,), spread (6,)
+    # Outputs: r (2,), J_camera (2, 12), J_line (2, 4)
+    # Operations: 588, temporaries: 122.
+    camera = ca.SX.sym("camera", 12, 1)
+    P00 = camera[0, 0]
+    P01 = camera[1, 0]
+    P02 = camera[2, 0]
+    P03 = camera[3, 0]
+    P10 = camera[4, 0]
+    P11 = camera[5, 0]
+    P12 = camera[6, 0]
+    P13 = camera[7, 0]
+    P20 = camera[8, 0]
+    P21 = camera[9, 0]
+    P22 = camera[10, 0]
+    P23 = camera[11, 0]
+    line = ca.SX.sym("line", 6, 1)
+    nx = line[0, 0]
+    ny = line[1, 0]
+    nz = line[2, 0]
+    vx = line[3, 0]
+    vy = line[4, 0]
+    vz = line[5, 0]
+    segment = ca.SX.sym("segment", 4, 1)
+    x1 = segment[0, 0]
+    y1 = segment[1, 0]
+    x2 = segment[2, 0]
+    y2 = segment[3, 0]
+    spread = ca.SX.sym("spread", 6, 1)
+    xx1 = spread[0, 0]
+    xy1 = spread[1, 0]
+    yy1 = spread[2, 0]
+    xx2 = spread[3, 0]
+    xy2 = spread[4, 0]
+    yy2 = spread[5, 0]
+    t0 = P11*P22 - P12*P21
+    t1 = P12*P20 - P10*P22
+    t2 = P10*P21 - P11*P20
+    t3 = P20*vx + P21*vy + P22*vz
+    t4 = P10*vx + P11*vy + P12*vz
+    seen0 = P13*t3 + nx*t0 + ny*t1 + nz*t2 - P23*t4
+    t12 = seen0*seen0
+    t5 = P02*P21 - P01*P22
+    t6 = P00*P22 - P02*P20
+    t7 = P01*P20 - P00*P21
+    t8 = P00*vx + P01*vy + P02*vz
+    seen1 = P23*t8 + nx*t5 + ny*t6 + nz*t7 - P03*t3
+    t13 = seen1*seen1
+    t14 = seen1*xy1
+    t15 = 2.0*seen0
+    t16 = t12*xx1 + t13*yy1 + t14*t15
+    t17 = 1.0/ca.sqrt(t16)
+    t10 = P02*P10 - P00*P12
+    t11 = P00*P11 - P01*P10
+    t9 = P01*P12 - P02*P11
+    seen2 = P03*t4 + nx*t9 + ny*t10 + nz*t11 - P13*t8
+    t18 = seen2 + seen0*x1 + seen1*y1
+    t20 = seen1*xy2
+    t21 = t12*xx2 + t13*yy2 + t15*t20
+    t22 = 1.0/ca.sqrt(t21)
+    t23 = seen2 + seen0*x2 + seen1*y2
+    t19 = t18/(t16*ca.sqrt(t16))
+    slope01 = t17*y1 + t19*(-seen0*xy1 - seen1*yy1)
+    slope02 = t17
+    t41 = P22*ny + P23*vx - P21*nz
+    t42 = P12*ny + P13*vx - P11*nz
+    t43 = -t42
+    t44 = P20*nz + P23*vy - P22*nx
+    t45 = P10*nz + P13*vy - P12*nx
+    t46 = -t45
+    t47 = P21*nx + P23*vz - P20*ny
+    t48 = P11*nx + P13*vz - P10*ny
+    t49 = -t48
+    t50 = -t3
+    slope00 = t17*x1 + t19*(-t14 - seen0*xx1)
+    t51 = P02*ny + P03*vx - P01*nz
+    t52 = -t41
+    t53 = P00*nz + P03*vy - P02*nx
+    t54 = -t44
+    t55 = P01*nx + P03*vz - P00*ny
+    t56 = -t47
+    t57 = -t8
+    t58 = -t51
+    t59 = -t53
+    t60 = -t55
+    t61 = -t4
+    t24 = t23/(t21*ca.sqrt(t21))
+    slope11 = t22*y2 + t24*(-seen0*xy2 - seen1*yy2)
+    slope12 = t22
+    slope10 = t22*x2 + t24*(-t20 - seen0*xx2)
+    t62 = P13*P20 - P10*P23
+    t25 = nx + vx
+    t26 = ny + vy
+    t27 = nz + vz
+    t28 = 1.0/ca.sqrt(t25*t25 + t26*t26 + t27*t27)
+    sum0 = t25*t28
+    sum2 = t27*t28
+    t33 = ca.if_else(sum2 > 0.0, 1.0, -1.0)
+    t34 = 1.0/(sum2 + t33)
+    across_sum00 = 1.0 - sum0*sum0*t33*t34
+    t63 = 0.5*across_sum00
+    sum1 = t26*t28
+    t35 = sum1*t34
+    t36 = sum0*t33
+    across_sum10 = -t35*t36
+    t64 = 0.5*across_sum10
+    t65 = P13*P21 - P11*P23
+    across_sum20 = -t36
+    t66 = 0.5*across_sum20
+    t67 = P13*P22 - P12*P23
+    t68 = t0*t63 + t1*t64 + t2*t66 + t62*t63 + t64*t65 + t66*t67
+    t69 = P00*P23 - P03*P20
+    t70 = P01*P23 - P03*P21
+    t71 = P02*P23 - P03*P22
+    t72 = t5*t63 + t6*t64 + t63*t69 + t64*t70 + t66*t7 + t66*t71
+    t73 = P03*P10 - P00*P13
+    t74 = P03*P11 - P01*P13
+    t75 = P03*P12 - P02*P13
+    t76 = t10*t64 + t11*t66 + t63*t73 + t63*t9 + t64*t74 + t66*t75
+    across_sum01 = -sum0*t35
+    t77 = 0.5*across_sum01
+    across_sum11 = t33 - sum1*sum1*t34
+    t78 = 0.5*across_sum11
+    across_sum21 = -sum1
+    t79 = 0.5*across_sum21
+    t80 = t0*t77 + t1*t78 + t2*t79 + t62*t77 + t65*t78 + t67*t79
+    t81 = t5*t77 + t6*t78 + t69*t77 + t7*t79 + t70*t78 + t71*t79
+    t82 = t10*t78 + t11*t79 + t73*t77 + t74*t78 + t75*t79 + t77*t9
+    t29 = nx - vx
+    t30 = ny - vy
+    t31 = nz - vz
+    t32 = 1.0/ca.sqrt(t29*t29 + t30*t30 + t31*t31)
+    rest0 = t29*t32
+    rest2 = t31*t32
+    t37 = ca.if_else(rest2 > 0.0, 1.0, -1.0)
+    t38 = 1.0/(rest2 + t37)
+    across_rest00 = 1.0 - rest0*rest0*t37*t38
+    rest1 = t30*t32
+    t39 = rest1*t38
+    t40 = rest0*t37
+    across_rest10 = -t39*t40
+    across_rest20 = -t40
+    t83 = 0.5*across_rest00
+    t84 = 0.5*across_rest10
+    t85 = 0.5*across_rest20
+    t86 = 0.5*across_rest00*t0 + 0.5*across_rest10*t1 + 0.5*across_rest20*t2 - t62*t83 - t65*t84 - t67*t85
+    t87 = 0.5*across_rest00*t5 + 0.5*across_rest10*t6 + 0.5*across_rest20*t7 - t69*t83 - t70*t84 - t71*t85
+    t88 = 0.5*across_rest00*t9 + 0.5*across_rest10*t10 + 0.5*across_rest20*t11 - t73*t83 - t74*t84 - t75*t85
+    across_rest01 = -rest0*t39
+    across_rest11 = t37 - rest1*rest1*t38
+    across_rest21 = -rest1
+    t89 = 0.5*across_rest01
+    t90 = 0.5*across_rest11
+    t91 = 0.5*across_rest21
+    t92 = 0.5*across_rest01*t0 + 0.5*across_rest11*t1 + 0.5*across_rest21*t2 - t62*t89 - t65*t90 - t67*t91
+    t93 = 0.5*across_rest01*t5 + 0.5*across_rest11*t6 + 0.5*across_rest21*t7 - t69*t89 - t70*t90 - t71*t91
+    t94 = 0.5*across_rest01*t9 + 0.5*across_rest11*t10 + 0.5*across_rest21*t11 - t73*t89 - t74*t90 - t75*t91
+    r = ca.SX(2, 1)
+    r[0, 0] = t17*t18
+    r[1, 0] = t22*t23
+    J_camera = ca.SX(2, 12)
+    J_camera[0, 0] = -slope01*t41 - slope02*t43
+    J_camera[0, 1] = -slope01*t44 - slope02*t46
+    J_camera[0, 2] = -slope01*t47 - slope02*t49
+    J_camera[0, 3] = -slope01*t50 - slope02*t4
+    J_camera[0, 4] = -slope00*t52 - slope02*t51
+    J_camera[0, 5] = -slope00*t54 - slope02*t53
+    J_camera[0, 6] = -slope00*t56 - slope02*t55
+    J_camera[0, 7] = -slope00*t3 - slope02*t57
+    J_camera[0, 8] = -slope00*t42 - slope01*t58
+    J_camera[0, 9] = -slope00*t45 - slope01*t59
+    J_camera[0, 10] = -slope00*t48 - slope01*t60
+    J_camera[0, 11] = -slope00*t61 - slope01*t8
+    J_camera[1, 0] = -slope11*t41 - slope12*t43
+    J_camera[1, 1] = -slope11*t44 - slope12*t46
+    J_camera[1, 2] = -slope11*t47 - slope12*t49
+    J_camera[1, 3] = -slope11*t50 - slope12*t4
+    J_camera[1, 4] = -slope10*t52 - slope12*t51
+    J_camera[1, 5] = -slope10*t54 - slope12*t53
+    J_camera[1, 6] = -slope10*t56 - slope12*t55
+    J_camera[1, 7] = -slope10*t3 - slope12*t57
+    J_camera[1, 8] = -slope10*t42 - slope11*t58
+    J_camera[1, 9] = -slope10*t45 - slope11*t59
+    J_camera[1, 10] = -slope10*t48 - slope11*t60
+    J_camera[1, 11] = -slope10*t61 - slope11*t8
+    J_line = ca.SX(2, 4)
+    J_line[0, 0] = -slope00*t68 - slope01*t72 - slope02*t76
+    J_line[0, 1] = -slope00*t80 - slope01*t81 - slope02*t82
+    J_line[0, 2] = -slope00*t86 - slope01*t87 - slope02*t88
+    J_line[0, 3] = -slope00*t92 - slope01*t93 - slope02*t94
+    J_line[1, 0] = -slope10*t68 - slope11*t72 - slope12*t76
+    J_line[1, 1] = -slope10*t80 - slope11*t81 - slope12*t82
+    J_line[1, 2] = -slope10*t86 - slope11*t87 - slope12*t88
+    J_line[1, 3] = -slope10*t92 - slope11*t93 - slope12*t94
+    return ca.Function(
+        "projective_line_observe",
+        [camera, line, segment, spread],
+        [r, J_camera, J_line],
+        ["camera", "line", "segment", "spread"],
         ["r", "J_camera", "J_line"],
     )
 

@@ -71,20 +71,26 @@ class Diagnosis:
 
 
 def diagnosed(
-    system: BundleSystem, kernels: Table, known: NDArray[np.bool_], fixes_gauge: bool
+    system: BundleSystem,
+    kernels: Table,
+    known: NDArray[np.bool_],
+    fixes_gauge: bool,
+    gauge: int | None = None,
 ) -> Diagnosis:
     """Diagnose the normal equations at an estimate.
 
     Parameters
     ----------
     system : BundleSystem
-        The normal equations; metric cameras.
+        The normal equations; scales of homogeneous cameras and points are to be no unknowns.
     kernels : Table
         Back end.
     known : ndarray of bool, shape (m,)
         Points that are fixed: they are no unknowns.
     fixes_gauge : bool
         Whether anything is fixed or known that ties the frame; else all of the gauge is free.
+    gauge : int, optional
+        How many motions of the gauge are free, where that is known.
     """
     n, d = system.normal.g_cameras.shape
     W = Covariant().blocks(system)
@@ -98,11 +104,12 @@ def diagnosed(
     white = congruent(ties.A, system.normal.U)
     a, r = white.shape[1], ties.n_shared
     frozen = 0 if system.ties.A is None else int(np.count_nonzero(~system.ties.A.any(axis=1)))
-    unknowns = n * a - frozen + r + 3 * int(np.count_nonzero(free))
+    unknowns = n * a - frozen + r + system.V.shape[1] * int(np.count_nonzero(free))
     unknowns += sum(own.g_points.size for own in system.normal.others)
-    gauge = _free_gauge(system, kernels) if fixes_gauge else system.model.gauge_dimension
+    if gauge is None:
+        gauge = _free_gauge(system, kernels) if fixes_gauge else system.model.gauge_dimension
     nothing = np.zeros((n, d))
-    silent: dict[str, Any] = {"spread": nothing, "points": np.zeros((len(free), 3))}
+    silent: dict[str, Any] = {"spread": nothing, "points": np.zeros(system.normal.g_points.shape)}
     silent["gauge"] = gauge
     if not system.normal.coupling.direct:
         return Diagnosis(unknowns - gauge - of_points, 0, float("inf"), nothing, **silent)
@@ -144,7 +151,10 @@ def diagnosed(
 def _followed(system: BundleSystem, own: Array) -> Array:
     """Return where the points go with cameras moving by own tangents (n, d): -V^-1 W^T x."""
     pull = system.normal.coupling.to_points(None, np.ascontiguousarray(own))
-    return -solved_points(system.normal.V, pull, 1e-12)
+    if not system.model.homogeneous:
+        return -solved_points(system.normal.V, pull, 1e-12)
+    moved = -solved_points(system.V, system.ties.of_points(pull[..., None])[..., 0], 1e-12)
+    return system.ties.points(moved[..., None])[..., 0]
 
 
 def _beside_gauge(system: BundleSystem, kernels: Table, own: Array) -> Array:

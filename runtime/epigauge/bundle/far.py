@@ -58,7 +58,9 @@ class JumpingProblem(BundleProblem):
     def of(asked: BundleProblem) -> JumpingProblem:
         """Return this for the measurements of a problem."""
         parts = {part.name: getattr(asked, part.name) for part in fields(BundleProblem)}
-        parts["linearizer"] = asked.linearizer.with_loss(Loss("cauchy", _SCALE))
+        loss = Loss("cauchy", _SCALE)
+        parts["linearizer"] = asked.linearizer.with_loss(loss)
+        parts["kinds"] = tuple(kind.with_loss(loss) for kind in asked.kinds)
         return JumpingProblem(**parts)
 
     def refined(self, cameras: Array, points: Array) -> tuple[Array, Array]:
@@ -205,23 +207,21 @@ def _is_far(problem: BundleProblem, start: Estimate) -> bool:
 
 
 def minimized_from(
-    minimized: Callable[[Array, Array], tuple[lm.Outcome[BundleState], Array, Array]],
-    cameras: Array,
-    points: Array,
-) -> tuple[lm.Outcome[BundleState], Array, Array]:
+    minimized: Callable[[Estimate], tuple[lm.Outcome[BundleState], Estimate]], start: Estimate
+) -> tuple[lm.Outcome[BundleState], Estimate]:
     """Minimise from a start or, where no step can be made from it, from one a thousandth away.
 
     Parameters
     ----------
     minimized : callable
-        Returns outcome, cameras and points; the steps may turn out singular.
-    cameras, points : ndarray, shape (n, 12), (m, 4)
-        The start.
+        Returns outcome and estimate; the steps may turn out singular.
+    start : Estimate
+        Where to begin.
 
     Returns
     -------
-    outcome, cameras, points
-        Of the better of both.
+    outcome, estimate
+        Those of the better of both.
 
     Raises
     ------
@@ -232,19 +232,19 @@ def minimized_from(
     try:
         # A start with a point in a focal plane has no finite blocks: its cost tells.
         with np.errstate(invalid="ignore", over="ignore"):
-            found = minimized(cameras, points)
+            found = minimized(start)
         stuck = not any(row.accepted for row in found[0].history[1:])
         if not (stuck and found[0].status in (-3, -1)):
             return found
     except np.linalg.LinAlgError:
         pass
     rng = np.random.default_rng(0)
-    nudged = (
+    cameras, points = (
         part + _NUDGE * np.linalg.norm(part, axis=1, keepdims=True) * rng.normal(size=part.shape)
-        for part in (cameras, points)
+        for part in (start.cameras, start.points)
     )
     try:
-        again = minimized(*nudged)
+        again = minimized(replace(start, cameras=cameras, points=points))
     except np.linalg.LinAlgError:
         if found is None:
             raise

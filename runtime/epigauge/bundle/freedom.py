@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,9 @@ from numpy.typing import NDArray
 from epigauge.bundle.linearizer import Normal
 from epigauge.bundle.solve import Border
 from epigauge.bundle.ties import Ties
+
+if TYPE_CHECKING:
+    from epigauge.bundle.moves import Move
 
 __all__ = ["Freedom"]
 
@@ -46,6 +50,6 @@ class Freedom:
         """Return cameras after a step, given where their model takes them."""
         return moved
 
-    def settled(self, cameras: Array, points: Array, steps: int) -> tuple[Array, Array]:
-        """Return an estimate in the gauge after so many accepted steps."""
-        return cameras, points
+    def moving(self, cameras: Array, points: Array, steps: int) -> Move | None:
+        """Return what moves an estimate into the gauge after so many accepted steps."""
+        return None

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.bundle.freedom import Freedom
+from epigauge.bundle.linearizer import FeatureKind
 from epigauge.bundle.prior_kinds import Prior, listed_priors
 from epigauge.bundle.priors import Priors
 from epigauge.bundle.refinement import fixed_indices, refined_freedom, whole_freedom
@@ -59,6 +60,10 @@ class Job:
         Whether something fixed or known ties the reconstruction to its frame.
     whitening : ndarray, shape (2, 2, N), or None
         What residuals are multiplied by, where their coordinates are not measured alike.
+    kinds : tuple of FeatureKind
+        Features of other kinds than points.
+    others : tuple of ndarray
+        Where they start.
     """
 
     model: CameraModel
@@ -71,6 +76,8 @@ class Job:
     priors: Priors | None = None
     fixes_gauge: bool = False
     whitening: Array | None = None
+    kinds: tuple[FeatureKind, ...] = ()
+    others: tuple[Array, ...] = ()
 
 
 def job_of(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -233,6 +233,12 @@ class FeatureKind(Protocol):
     def moved(self, cameras: Array, points: Array, step: Array) -> Array:
         """Return the features after a step (k, t) of their tangents at these cameras."""
 
+    def carried(self, move: Any, points: Array) -> Array:
+        """Return the features after a `Move` of space."""
+
+    def with_loss(self, loss: Loss) -> FeatureKind:
+        """Return the same observations with another loss."""
+
 
 class Linearizer(Protocol):
     """Evaluates cameras (n, c) and points (m, b)."""
@@ -292,12 +298,12 @@ def point_damping(model: CameraModel, V: Array, depth: Array | None) -> Array:
     V : ndarray, shape (m, b, b)
         Point blocks of J^T J.
     depth : ndarray, shape (m, b, b), or None
-        Those of Z^T Z, for homogeneous points.
+        Those of Z^T Z, for homogeneous points. Lines have none: in a basis that is the same up to
+        an orthonormal change, as that of the covariant method, the trace stays as it is.
     """
-    if model.homogeneous:
-        assert depth is not None
+    if depth is not None:
         return V + depth
-    if not model.metric:
+    if not (model.metric or model.homogeneous):
         return V
     trace = np.einsum("mii->m", V) / V.shape[1]
     return np.asarray(trace[:, None, None] * np.eye(V.shape[1]))

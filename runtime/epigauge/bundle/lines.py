@@ -1,8 +1,10 @@
 """Lines: a kind of features of four unknowns, beside points.
 
-A line is a row (n, v) of Pluecker coordinates with v a unit vector. Its update is that of its
-orthonormal representation about the centre, of those cameras that see it, that is farthest from it:
-similarities take it along, and the line is off it.
+A line is a row (n, v) of Pluecker coordinates. With calibrated cameras v is a unit vector, and the
+update is that of the orthonormal representation about the centre, of those cameras that see the
+line, that is farthest from it: similarities take it along, and the line is off it. In a projective
+basis the whole row has length one and the representation is that of four dimensions, the same in
+all bases that differ by an orthonormal matrix; the covariant method computes in one of these.
 """
 
 from __future__ import annotations
@@ -13,13 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.bundle.moves import Move
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.cameras import CameraModel
 from epigauge.kernels import Table
 from epigauge.two_view.losses import Loss
 
-__all__ = ["LineLinearizer", "Segments", "unit_lines"]
+__all__ = ["LineLinearizer", "Segments", "sized_lines"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -39,7 +42,8 @@ class Segments:
     view, line : ndarray of int, shape (N,)
         Sorted by line, then view.
     ends, spread : ndarray, shape (4, N), (6, N)
-        Pixels of both end points, and their covariances where a point of weight one has one.
+        Both end points as the cameras see them, and the covariances that the squared distance of an
+        end point of weight one is divided by.
     prefix : str
         What the kernels are called.
     intrinsics : ndarray, shape (n, 4), or None
@@ -103,6 +107,22 @@ class LineLinearizer(NumpyLinearizer):
         parts = model, kernels, graph, segments.ends, ones, loss or Loss()
         return LineLinearizer(*parts, segments=segments)
 
+    @property
+    def has_depths(self) -> bool:
+        """Tell whether Z = d log depth belongs to the damping: lines have no depth."""
+        return False
+
+    @property
+    def _kernels(self) -> str:
+        """Return what the kernels of the update begin with."""
+        return "projective_line" if self.model.homogeneous else "line"
+
+    def _about(self, cameras: Array, lines: Array) -> tuple[Array, ...]:
+        """Return where updates are written, (3, L) of an origin each; of no place in a basis."""
+        if self.model.homogeneous:
+            return ()
+        return (self.segments.origins(cameras, lines).T,)
+
     def residuals(self, cameras: Array, points: Array) -> Array:
         """Return the distances over their deviations, (2, N)."""
         own = self.segments
@@ -116,8 +136,8 @@ class LineLinearizer(NumpyLinearizer):
         own = self.segments
         observe = getattr(self.kernels, f"{own.prefix}_line_observe")
         with np.errstate(**_QUIET):
-            origin = own.origins(cameras, points).T[:, own.line]
-            parts = own.cameras(cameras), points.T[:, own.line], origin, own.ends, own.spread
+            about = [place[:, own.line] for place in self._about(cameras, points)]
+            parts = own.cameras(cameras), points.T[:, own.line], *about, own.ends, own.spread
             r, by_camera, by_line = observe(*parts)
         if own.intrinsics is None:
             return r, by_camera, by_line
@@ -127,14 +147,15 @@ class LineLinearizer(NumpyLinearizer):
         return r, A, by_line
 
     def generators(self, cameras: Array, lines: Array) -> Array:
-        """Return the velocities of lines by the gauge, as updates, (L, 4, 7)."""
-        origins = self.segments.origins(cameras, lines)
-        return np.asarray(self.kernels.line_generators(lines.T, origins.T).transpose(2, 0, 1))
+        """Return the velocities of lines by the gauge, as updates, (L, 4, g)."""
+        generators = getattr(self.kernels, f"{self._kernels}_generators")
+        return np.asarray(generators(lines.T, *self._about(cameras, lines)).transpose(2, 0, 1))
 
     def tangents(self, cameras: Array, lines: Array) -> Array:
-        """Return the derivatives of lines with unit directions by their updates, (L, 6, 4)."""
-        origins = self.segments.origins(cameras, lines)
-        return np.asarray(self.kernels.line_unit_tangent(lines.T, origins.T).transpose(2, 0, 1))
+        """Return the derivatives of lines, of the length they have here, by updates, (L, 6, 4)."""
+        name = "projective_line_tangent" if self.model.homogeneous else "line_unit_tangent"
+        tangent = getattr(self.kernels, name)
+        return np.asarray(tangent(lines.T, *self._about(cameras, lines)).transpose(2, 0, 1))
 
     def _of_one(self, alone: ObservationGraph, rows: slice) -> LineLinearizer:
         """Return the segments of one line, which becomes the only one."""
@@ -145,16 +166,34 @@ class LineLinearizer(NumpyLinearizer):
 
     def moved(self, cameras: Array, points: Array, step: Array) -> Array:
         """Return the lines after a step of their tangents at these cameras."""
-        origins = self.segments.origins(cameras, points)
+        retract = getattr(self.kernels, f"{self._kernels}_retract")
         with np.errstate(**_QUIET):
-            moved = np.array(self.kernels.line_retract(points.T, origins.T, step.T).T)
-            moved /= np.linalg.norm(moved[:, 3:], axis=1, keepdims=True)
+            moved = np.array(retract(points.T, *self._about(cameras, points), step.T).T)
+            if not self.model.homogeneous:
+                moved /= np.linalg.norm(moved[:, 3:], axis=1, keepdims=True)
         return moved
 
+    def carried(self, move: Move, points: Array) -> Array:
+        """Return the lines after a move of space."""
+        return self.sized(move.lines(points))
 
-def unit_lines(lines: Array) -> Array:
-    """Return Pluecker coordinates with n orthogonal to v, and v of length one."""
-    n, v = lines[:, :3], lines[:, 3:]
-    length = np.linalg.norm(v, axis=1, keepdims=True)
-    n, v = n / length, v / length
-    return np.concatenate([n - np.sum(n * v, axis=1, keepdims=True) * v, v], axis=1)
+    def sized(self, lines: Array) -> Array:
+        """Return lines of the length they have here: unit directions, or of length one."""
+        return sized_lines(lines, self.model)
+
+
+def sized_lines(lines: Array, model: CameraModel) -> Array:
+    """Return Pluecker coordinates with n orthogonal to v, as the cameras of a model have them.
+
+    Unit directions v; in a projective basis, where any line may be infinitely far, length one.
+    """
+    with np.errstate(**_QUIET):
+        if not model.homogeneous:
+            lines = lines / np.linalg.norm(lines[:, 3:], axis=1, keepdims=True)
+            n, v = lines[:, :3], lines[:, 3:]
+            return np.concatenate([n - np.sum(n * v, axis=1, keepdims=True) * v, v], axis=1)
+        lines = lines / np.linalg.norm(lines, axis=1, keepdims=True)
+        # The nearest on the quadric: n + v and n - v get the same length.
+        n, v = lines[:, :3], lines[:, 3:]
+        sides = [side / np.linalg.norm(side, axis=1, keepdims=True) for side in (n + v, n - v)]
+        return np.concatenate([sides[0] + sides[1], sides[0] - sides[1]], axis=1) / 2.0

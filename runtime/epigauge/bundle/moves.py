@@ -12,6 +12,7 @@ from epigauge.bundle.similarity import normal_frame
 from epigauge.cameras import CameraModel
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.gauge import Gauge, Transformation, identity, normalized
+from epigauge.multi_view.gauge.transformations import moved_lines
 
 __all__ = ["Move", "best_conditioned", "move_into"]
 
@@ -23,6 +24,9 @@ class Move(Protocol):
 
     def apply(self, cameras: Array, points: Array) -> tuple[Array, Array]:
         """Return moved cameras (n, c) and points (m, b)."""
+
+    def lines(self, lines: Array) -> Array:
+        """Return moved lines, Pluecker coordinates (L, 6)."""
 
     def inverse(self) -> Move:
         """Return the move back."""
@@ -41,6 +45,10 @@ class _Projective:
         """Return moved cameras (n, 12) and points (m, 4)."""
         P, Q = self.transformation.apply(cameras.reshape(-1, 3, 4), points)
         return P.reshape(-1, 12), Q
+
+    def lines(self, lines: Array) -> Array:
+        """Return moved lines (L, 6)."""
+        return self.transformation.lines(lines)
 
     def inverse(self) -> _Projective:
         """Return the move back."""
@@ -62,6 +70,10 @@ class _Affine:
         P = cameras.reshape(-1, 3, 4) @ np.linalg.inv(self.T)
         P[:, 2] = np.array([0.0, 0.0, 0.0, 1.0])
         return P.reshape(-1, 12), points @ self.T[:3, :3].T + self.T[:3, 3]
+
+    def lines(self, lines: Array) -> Array:
+        """Return moved lines (L, 6)."""
+        return moved_lines(self.T, lines)
 
     def inverse(self) -> _Affine:
         """Return the move back."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,9 +71,14 @@ class NumpyLinearizer:
     whitening: Array | None = None
     heaviest: float | None = None
 
-    def with_loss(self, loss: Loss) -> NumpyLinearizer:
+    def with_loss(self, loss: Loss) -> Self:
         """Return the same observations with another loss."""
         return replace(self, loss=loss)
+
+    @property
+    def has_depths(self) -> bool:
+        """Tell whether Z = d log depth belongs to the damping."""
+        return self.model.homogeneous
 
     def residuals(self, cameras: Array, points: Array) -> Array:
         """Return r = q - q_hat, (2, N)."""
@@ -129,7 +134,7 @@ class NumpyLinearizer:
             # A start with a point in a focal plane has no finite blocks; its cost stops the run.
             root = np.sqrt(self.weights_at(r))
             blocks = None
-            if self.model.homogeneous:
+            if self.has_depths:
                 Z = self.log_depths(cameras, points)
                 blocks = self._sums(root * Z[0], root * Z[1])
             return normal_equations(self.graph, root * A, root * B, -root * r, blocks)
@@ -171,7 +176,7 @@ class NumpyLinearizer:
                 V = graph.sum_points(np.einsum("ikn,iln->nkl", B, B))
                 g = -graph.sum_points(np.einsum("ikn,in->nk", B, np.sqrt(weight) * r))
                 depth = None
-                if self.model.homogeneous:
+                if self.has_depths:
                     Z = (np.sqrt(weight) * self.log_depths(cameras, points)[1]).T
                     depth = graph.sum_points(Z[:, :, None] * Z[:, None, :])
                 D = point_damping(self.model, V, depth)

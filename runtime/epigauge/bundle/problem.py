@@ -180,7 +180,11 @@ class BundleProblem:
             own.moved(state.cameras, rows, tangents)
             for (own, rows), tangents in zip(self._each(state.estimate), step.others, strict=True)
         )
-        cameras, points = self.freedom.settled(cameras, points, steps)
+        move = self.freedom.moving(cameras, points, steps)
+        if move is not None:
+            cameras, points = move.apply(cameras, points)
+            pairs = zip(self.kinds, others, strict=True)
+            others = tuple(kind.carried(move, rows) for kind, rows in pairs)
         if self.model.homogeneous:
             cameras, points = in_range(cameras), in_range(points)
         if self.refinement is None:

@@ -22,7 +22,7 @@ from epigauge.bundle.dampings import (
 )
 from epigauge.bundle.jobs import Job
 from epigauge.bundle.linearizer import PointRefinement
-from epigauge.bundle.moves import best_conditioned, move_into
+from epigauge.bundle.moves import Move, best_conditioned, move_into
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.problem import BundleProblem, BundleState, Estimate
 from epigauge.bundle.similarity import Similarity
@@ -33,7 +33,13 @@ from epigauge.kernels import Table
 from epigauge.multi_view.gauge import GAUGES, Gauge, five_points, identity
 from epigauge.two_view.losses import Loss
 
-__all__ = ["bundle_problem", "checked_gauge", "minimized"]
+__all__ = [
+    "bundle_problem",
+    "checked_gauge",
+    "conditioned_problem",
+    "minimized",
+    "minimized_features",
+]
 
 Array = NDArray[np.float64]
 
@@ -99,6 +105,48 @@ def bundle_problem(
     )
 
 
+def conditioned_problem(
+    job: Job,
+    graph: ObservationGraph,
+    weights: Array,
+    kernels: Table,
+    loss: Loss | None = None,
+    at: Estimate | None = None,
+    **parts: Any,
+) -> tuple[Move, BundleProblem, Estimate]:
+    """Return the problem of a job where computing suits best: the move there, problem, estimate.
+
+    Parameters
+    ----------
+    job : Job
+        Model, measurements, what is free and known, features of other kinds.
+    graph : ObservationGraph
+        Which observation belongs to what.
+    weights : ndarray, shape (N,)
+        Factor of each squared residual of points.
+    kernels : Table
+        Back end.
+    loss : Loss, optional
+        Applied to each squared residual.
+    at : Estimate, optional
+        In the frame of the job; its start by default.
+    **parts
+        Further options of `bundle_problem`.
+    """
+    at = Estimate(job.cameras, job.points, others=job.others) if at is None else at
+    home, cameras, points = best_conditioned(job.model, at.cameras, at.points)
+    kinds = tuple(kind.with_loss(loss or Loss()) for kind in job.kinds)
+    others = tuple(kind.carried(home, rows) for kind, rows in zip(kinds, at.others, strict=True))
+    priors = job.priors
+    if priors is not None:
+        assert isinstance(home, Similarity)
+        priors = priors.moved(home)
+    observed = job.model, kernels, graph, job.q, weights, loss
+    parts = {"freedom": job.freedom, "whitening": job.whitening, "priors": priors, **parts}
+    problem = bundle_problem(*observed, kinds=kinds, **parts)
+    return home, problem, Estimate(cameras, points, others=others)
+
+
 def checked_gauge(gauge: Any, method: str) -> Gauge | None:
     """Return a gauge given to a method; a class takes its defaults."""
     strategy = STRATEGIES[method]
@@ -113,6 +161,17 @@ def checked_gauge(gauge: Any, method: str) -> Gauge | None:
 
 
 def minimized(
+    job: Job, graph: ObservationGraph, weights: Array, kernels: Table, **how: Any
+) -> tuple[lm.Outcome[BundleState], Array, Array]:
+    """Minimise by a method; return how it ended, and cameras and points in the gauge of the result.
+
+    Arguments are those of `minimized_features`.
+    """
+    outcome, found = minimized_features(job, graph, weights, kernels, **how)
+    return outcome, found.cameras, found.points
+
+
+def minimized_features(
     job: Job,
     graph: ObservationGraph,
     weights: Array,
@@ -128,8 +187,8 @@ def minimized(
     stopping: lm.Stopping,
     workers: int | Elsewhere,
     callback: Callable[[lm.Row], object] | None,
-) -> tuple[lm.Outcome[BundleState], Array, Array]:
-    """Minimise by a method; return how it ended, and cameras and points in the gauge of the result.
+) -> tuple[lm.Outcome[BundleState], Estimate]:
+    """Minimise by a method; return how it ended, and the estimate in the gauge of the result.
 
     Normal equations that were not needed to the end are made when the `system` of the outcome is
     called.
@@ -181,23 +240,28 @@ def minimized(
     wanted = own_gauge or explicit
     home = isinstance(act, Covariant) and gauge is None and wanted is None
     homogeneous = job.model.homogeneous
+    kinds = tuple(kind.with_loss(loss) for kind in job.kinds)
 
-    def checked(cameras: Array, points: Array, state: BundleState, begun: Estimate) -> bool:
+    def moved(there: Move, at: Estimate) -> Estimate:
+        """Return an estimate after a move of space."""
+        pairs = zip(kinds, at.others, strict=True)
+        others = tuple(kind.carried(there, rows) for kind, rows in pairs)
+        return Estimate(*there.apply(at.cameras, at.points), others=others)
+
+    def conditioned(at: Estimate) -> Estimate:
+        return moved(best_conditioned(job.model, at.cameras, at.points)[0], at)
+
+    def checked(reached: BundleState, begun: Estimate) -> bool:
         """Tell whether the default method finds nothing lower, either."""
-        free = bundle_problem(
-            *(job.model, kernels, graph, job.q, weights, loss), embedded=True, workers=workers
-        )
-        moved = BundleState(Estimate(*best_conditioned(job.model, cameras, points)[1:]), state.cost)
-        start = Estimate(*best_conditioned(job.model, begun.cameras, begun.points)[1:])
-        return not far.short_of_minimum(free, moved, start)
+        parts = job.model, kernels, graph, job.q, weights, loss
+        free = bundle_problem(*parts, embedded=True, workers=workers, kinds=kinds)
+        there = BundleState(conditioned(reached.estimate), reached.cost)
+        return not far.short_of_minimum(free, there, conditioned(begun))
 
-    def attempt(cameras: Array, points: Array) -> tuple[lm.Outcome[BundleState], Array, Array]:
-        start = job.model, cameras, points
-        if home:
-            there, cameras, points = best_conditioned(*start)
-        else:
-            there = move_into(wanted or identity(), *start)
-            cameras, points = there.apply(cameras, points)
+    def attempt(at: Estimate) -> tuple[lm.Outcome[BundleState], Estimate]:
+        start = job.model, at.cameras, at.points
+        there = best_conditioned(*start)[0] if home else move_into(wanted or identity(), *start)
+        begun = moved(there, at)
         priors = job.priors
         if priors is not None:
             assert isinstance(there, Similarity)
@@ -212,10 +276,11 @@ def minimized(
             embedded=embedded and strategy.embedded and name == "covariant",
             workers=workers,
             freedom=freedom_of(
-                strategy, explicit, job.model, kernels, cameras, chosen, job.freedom
+                strategy, explicit, job.model, kernels, begun.cameras, chosen, job.freedom
             ),
             priors=priors,
             whitening=job.whitening,
+            kinds=kinds,
         )
         # Points jump alike whatever the basis, but only in the one chosen here: in no gauge.
         # Where points are elsewhere they can stay there from step to step.
@@ -224,23 +289,24 @@ def minimized(
             problem = resident(problem)
         jumps = homogeneous and problem.refinement is not None and gauge is None
         minimize = far.minimize if jumps else lm.minimize
-        begun, unit = Estimate(cameras, points), job.scale_px**2
+        unit = job.scale_px**2
         outcome = minimize(problem, begun, act, schedule(), stopping, callback, unit)
         outcome = problem.fetched(outcome)
         if homogeneous and home and outcome.system is None and np.isfinite(outcome.state.cost):
             later: Any = partial(problem.linearize, outcome.state)
             outcome = replace(outcome, system=later)
-        found = outcome.state.cameras, outcome.state.points
         claims = homogeneous and outcome.status > 0 and not jumps
-        if claims and not checked(*found, outcome.state, begun):
+        if claims and not checked(outcome.state, begun):
             outcome = replace(outcome, status=-1)
-        return (outcome, *(there.inverse().apply(*found) if home else found))
+        found = outcome.state.estimate
+        return outcome, moved(there.inverse(), found) if home else found
 
+    first = Estimate(job.cameras, job.points, others=job.others)
     try:
         # What is fixed must not be moved by a thousandth.
         if homogeneous and not job.fixes_gauge:
-            return far.minimized_from(attempt, job.cameras, job.points)
-        return attempt(job.cameras, job.points)
+            return far.minimized_from(attempt, first)
+        return attempt(first)
     except np.linalg.LinAlgError:
         raise ArgumentError(
             "start",

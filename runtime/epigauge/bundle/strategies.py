@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from epigauge.bundle.freedom import Freedom
 from epigauge.bundle.linearizer import Normal
-from epigauge.bundle.moves import move_into
+from epigauge.bundle.moves import Move, move_into
 from epigauge.bundle.null_space import scales
 from epigauge.bundle.solve import Border
 from epigauge.bundle.ties import Ties
@@ -52,13 +52,13 @@ class InGauge(Freedom):
     every: int = 1
     with_constraints: bool = False
 
-    def settled(self, cameras: Array, points: Array, steps: int) -> tuple[Array, Array]:
-        """Return the estimate in the gauge, each so many steps."""
+    def moving(self, cameras: Array, points: Array, steps: int) -> Move | None:
+        """Return what moves the estimate into the gauge, each so many steps."""
         if steps % self.every:
-            return cameras, points
+            return None
         assert self.gauge is not None
         assert self.model is not None
-        return move_into(self.gauge, self.model, cameras, points).apply(cameras, points)
+        return move_into(self.gauge, self.model, cameras, points)
 
     def constrained(
         self, normal: Normal, cameras: Array, points: Array

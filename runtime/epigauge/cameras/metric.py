@@ -183,7 +183,7 @@ class MetricReconstruction(ReconstructionBase):
     def to_projective(self) -> Reconstruction:
         """Return the scene as projective cameras and points.
 
-        Distortion and lines have no place there.
+        Distortion has no place there.
 
         Returns
         -------
@@ -191,7 +191,8 @@ class MetricReconstruction(ReconstructionBase):
             ``P`` of this scene, and the points with a fourth coordinate one. It projects to the
             same pixels where the model has no distortion.
         """
-        return Reconstruction(self.P, np.column_stack([self.X, np.ones(len(self.X))]))
+        Q = np.column_stack([self.X, np.ones(len(self.X))])
+        return Reconstruction(self.P, Q, self.lines)
 
     def _images(self, tracks: Tracks, backend: str | None) -> tuple[Array, Array]:
         """Return pixels (2, N) and depths (N,)."""

@@ -18,7 +18,7 @@ from epigauge.io._common import MAX_MATCHES, cut
 from epigauge.io._npz import read_npz, write_npz
 from epigauge.io._scene import ColmapSource, RawScene, SceneSource
 from epigauge.io._track_reading import MEASURED, check_observations
-from epigauge.io._track_writing import arrays_of
+from epigauge.io._track_writing import arrays_of, projective_arrays
 from epigauge.io.output import writing
 from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.tracks import Tracks
@@ -71,8 +71,8 @@ def write_npz_scene(
             arrays |= {} if lines is None else {"lines": lines}
         case AffineReconstruction(P=P, X=X):
             arrays |= {"P": P, "X": X}
-        case Reconstruction(P=P, Q=Q):
-            arrays |= {"P": P, "Q": Q}
+        case Reconstruction():
+            arrays |= projective_arrays(reconstruction)
     if tracks.names is not None:
         arrays["names"] = _bytes(tracks.names)
     for name in ("sizes", "colours"):

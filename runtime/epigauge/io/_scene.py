@@ -183,7 +183,7 @@ def finished(
         if raw.model == "affine":
             reconstruction = AffineReconstruction(raw.R[views], raw.X[points])
         elif raw.model == "projective":
-            reconstruction = Reconstruction(raw.R[views], raw.X[points])
+            reconstruction = Reconstruction(raw.R[views], raw.X[points], raw.lines)
         else:
             made = Cameras(raw.model, raw.params[cameras], new_camera)
             reconstruction = MetricReconstruction(

@@ -118,7 +118,7 @@ def read_tracks(
         if image_size is not None:
             raise ArgumentError("image_size", f"is given for {path.name!r:.60}", "OpenSfM's tracks")
         if form == ".npz":
-            start = ("P", "Q", "X") if with_start else ()
+            start = ("P", "Q", "X", "lines") if with_start else ()
             optional = (*MEASURED, "weights", "clean", "n_views", "n_points", *start)
             return dict(
                 read_npz(path, file, [_TRACKS, ("P", "Q"), ("P", "X")], optional, ["names"])
@@ -198,7 +198,8 @@ def start_of(path: Path, found: dict[str, Any]) -> Reconstruction | None:
     if Q.ndim == 2 and Q.shape[1] == 3:
         Q = np.column_stack([Q, np.ones(len(Q))])
     try:
-        return Reconstruction(found["P"].astype(np.float64), Q.astype(np.float64))
+        P, lines = found["P"].astype(np.float64), found.get("lines")
+        return Reconstruction(P, Q.astype(np.float64), lines)
     except ArgumentError as error:
         raise FileFormatError(path, str(error)) from None
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from epigauge.errors import ArgumentError
 from epigauge.io._common import MAX_MATCHES
 from epigauge.io._text import is_number
+from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.tracks import Tracks
 
 Array = NDArray[np.float64]
@@ -37,6 +38,12 @@ def arrays_of(tracks: Tracks) -> dict[str, Any]:
     if tracks.whitening is not None:
         found["whitening"] = tracks.whitening.transpose(2, 0, 1)
     return found
+
+
+def projective_arrays(reconstruction: Reconstruction) -> dict[str, Any]:
+    """Return the arrays that stand for projective cameras, points and lines in NPZ."""
+    found = {"P": reconstruction.P, "Q": reconstruction.Q}
+    return found if reconstruction.lines is None else found | {"lines": reconstruction.lines}
 
 
 def write_csv(file: IO[bytes], tracks: Tracks) -> None:

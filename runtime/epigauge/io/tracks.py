@@ -24,7 +24,7 @@ from epigauge.io._track_reading import (
     rows_of,
     start_of,
 )
-from epigauge.io._track_writing import arrays_of, compressing, write_csv
+from epigauge.io._track_writing import arrays_of, compressing, projective_arrays, write_csv
 from epigauge.io.output import writing
 from epigauge.multi_view.labels import view_names
 from epigauge.multi_view.reconstruction import Reconstruction
@@ -195,7 +195,7 @@ def load_track_file(
         if len(start.P) <= old_views[-1] or len(start.Q) <= old_points[-1]:
             reason = f"has {len(start.P)} cameras and {len(start.Q)} points but tracks of more"
             raise FileFormatError(path, reason)
-        start = Reconstruction(start.P[old_views], start.Q[old_points])
+        start = Reconstruction(start.P[old_views], start.Q[old_points], start.lines)
     return TrackFile(tracks, start, old_views, old_points)
 
 
@@ -233,7 +233,8 @@ def _names(
 def load_reconstruction(path: PathLike) -> Reconstruction:
     """Read cameras and points from an NPZ or BAL file.
 
-    NPZ: arrays ``P`` (n, 3, 4) and ``Q`` (m, 4), or ``X`` of three or four columns. BAL:
+    NPZ: arrays ``P`` (n, 3, 4) and ``Q`` (m, 4), or ``X`` of three or four columns, and ``lines``
+    (L, 6) where there are any. BAL:
     P = diag(-f, -f, 1) (R | t), without the distortion.
 
     Parameters
@@ -297,9 +298,12 @@ def save_tracks(path: PathLike, tracks: Tracks, start: Reconstruction | None = N
     if start is not None and (len(start.P), len(start.Q)) != (tracks.n_views, tracks.n_points):
         was = f"has {len(start.P)} cameras and {len(start.Q)} points"
         raise ArgumentError("start", was, f"{tracks.n_views} and {tracks.n_points}, as the tracks")
+    if start is not None and start.lines is not None and form != ".npz":
+        needed = "a name ending in .npz, or dataclasses.replace(start, lines=None)"
+        raise ArgumentError("start", f"has {len(start.lines)} lines, which {form} loses", needed)
     with writing(path) as file:
         if form == ".npz":
-            arrays = arrays_of(tracks) | ({} if start is None else {"P": start.P, "Q": start.Q})
+            arrays = arrays_of(tracks) | ({} if start is None else projective_arrays(start))
             write_npz(file, arrays)
         elif form == ".csv":
             write_csv(file, tracks)
@@ -332,4 +336,4 @@ def save_reconstruction(path: PathLike, reconstruction: Reconstruction) -> None:
     """
     check_suffix(path, ".npz")
     with writing(path) as file:
-        write_npz(file, {"P": reconstruction.P, "Q": reconstruction.Q})
+        write_npz(file, projective_arrays(reconstruction))

@@ -91,8 +91,8 @@ def bundle_adjust(
         Where to begin, in any basis; by default `initialize(tracks)`.
     lines : LineTracks, optional
         Segments of lines, adjusted together with the points: the distances of their end points from
-        the images of the lines. For metric starts with one of the methods "covariant",
-        "levenberg" and "marquardt", without gauge, priors and `robust`. The lines begin at those of
+        the images of the lines. For metric and projective starts, with any method that adds a
+        matrix, without `robust` and ``gauge_mode="implicit"``. The lines begin at those of
         the start, or triangulated where that suits their segments better; without `lines` those of
         the start are left out, and the result has none. `workers` does not count. Cameras with
         distortion see end points that are undistorted once, with their covariances to first order:
@@ -245,34 +245,38 @@ def bundle_adjust(
         workers = threads = as_count("workers", workers)
     stopping = lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter)
     if lines is not None:
-        without = {"priors": priors, "gauge": gauge}
-        for name, value in without.items():
-            if value is not None:
-                raise ArgumentError(name, "is given with lines", "none, or no lines")
+        if workers != threads:
+            raise ArgumentError("lines", "are given with workers elsewhere", "none, or one machine")
+        begin = initialize(tracks, backend=backend) if start is None else start
         mixed = adjusted_lines(
             tracks,
-            start,
+            begin,
             lines,
             method=method,
+            gauge=gauge,
+            gauge_mode=gauge_mode,
             damping=damping,
-            schedule=SCHEDULES["adaptive" if schedule == "auto" else schedule],
             loss=loss,
             loss_scale_px=loss_scale_px,
-            stopping=stopping,
             backend=backend,
-            callback=callback,
+            options={
+                "embedded": embedded,
+                "schedule": SCHEDULES["adaptive" if schedule == "auto" else schedule],
+                "stopping": stopping,
+                "callback": callback,
+            },
             refine=refine,
             fixed_views=fixed_views,
             fixed_points=fixed_points,
-            embedded=embedded,
+            priors=priors,
+            noise_px=noise_px,
         )
         outcome, counts = mixed.outcome, tracks.weights > 0.0
-        verdict = Verdict(mixed.flags, mixed.rank, mixed.n_behind, mixed.condition)
         return BundleResult.unjudged(
-            lambda: verdict,
+            lambda: mixed.verdict,
             reconstruction=mixed.reconstruction,
             rms_px=float(np.sqrt(np.mean(mixed.fun[counts] ** 2))),
-            cost=outcome.state.cost,
+            cost=mixed.cost,
             fun=mixed.fun,
             method=method,
             loss_scale_px=mixed.loss_scale_px,

@@ -35,12 +35,10 @@ def usual(sizes: Array) -> float:
 
 
 def meets(A: Array, B: Array) -> Array:
-    """Return the lines (L, 6) in which planes (L, 4) meet, with unit directions."""
+    """Return the lines (L, 6) in which planes (L, 4) meet, of any length."""
     v = np.cross(A[:, :3], B[:, :3])
     n = A[:, 3:] * B[:, :3] - B[:, 3:] * A[:, :3]
-    with np.errstate(all="ignore"):
-        lines = np.concatenate([n, v], axis=1) / np.linalg.norm(v, axis=1, keepdims=True)
-    return np.asarray(lines)
+    return np.concatenate([n, v], axis=1)
 
 
 def agreeing(
@@ -80,7 +78,7 @@ def agreeing(
         rows = np.arange(graph.first[j], graph.first[j + 1])
         pairs = np.column_stack(np.triu_indices(len(rows), 1))
         pairs = rows[pairs[:: -(-len(pairs) // _PAIRS)]]
-        tried = meets(planes[pairs[:, 0]], planes[pairs[:, 1]])
+        tried = linearizer.sized(meets(planes[pairs[:, 0]], planes[pairs[:, 1]]))
         each, those = np.tile(rows, len(tried)), np.repeat(np.arange(len(tried)), len(rows))
         with np.errstate(all="ignore"):
             parts = rows_of_cameras[:, each], tried.T[:, those], own.ends[:, each]

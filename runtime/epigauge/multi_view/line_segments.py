@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from epigauge.bundle.lines import Segments
 from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
+from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.line_tracks import LineTracks
 
-__all__ = ["line_pieces", "segments_of"]
+__all__ = ["checked_lines", "frame_of", "line_pieces", "projective_segments", "segments_of"]
 
 Array = NDArray[np.float64]
 
@@ -22,6 +23,43 @@ _STEPS, _MISSED = 30, 1e-6
 
 #: A line of sight along the line meets it nowhere in particular.
 _PARALLEL = 1e-6
+
+
+def checked_lines(lines: Any, n_views: int) -> LineTracks:
+    """Return lines of so many views.
+
+    Raises
+    ------
+    ArgumentError
+        If they are none, or name other views.
+    """
+    if not isinstance(lines, LineTracks):
+        raise ArgumentError("lines", f"is a {type(lines).__name__}", "eg.LineTracks(...)")
+    if lines.view.max() >= n_views:
+        was = f"name view {lines.view.max()}"
+        raise ArgumentError("lines", was, f"views 0 to {n_views - 1}")
+    return lines
+
+
+def projective_segments(lines: LineTracks, frame: Frame, unit: float = 1.0) -> Segments:
+    """Return segments as projective cameras see them, in the image coordinates of a frame.
+
+    The covariances stay those of pixels: residuals are in the unit of the frame, as those of
+    points are.
+    """
+    ends = [frame.points_in(lines.segments[:, k : k + 2], lines.view) for k in (0, 2)]
+    spread = _whole(lines.spread.T / unit**2)
+    return Segments(lines.view, lines.line, np.concatenate(ends), spread, "projective")
+
+
+def frame_of(lines: LineTracks, n_views: int) -> Frame:
+    """Return image coordinates to compute in, where there are no points."""
+    middles = 0.5 * (lines.segments[:, :2] + lines.segments[:, 2:])
+    counts = np.maximum(np.bincount(lines.view, minlength=n_views), 1)
+    sums = [np.bincount(lines.view, middles[:, k], minlength=n_views) / counts for k in (0, 1)]
+    origins = np.stack(sums, axis=1)
+    off = lines.segments.reshape(-1, 2, 2) - origins[lines.view][:, None]
+    return Frame(origins, float(np.sqrt(np.mean(off**2))))
 
 
 def segments_of(
@@ -36,11 +74,7 @@ def segments_of(
     ArgumentError
         If a view has no camera, or an end point no direction in its camera.
     """
-    if not isinstance(lines, LineTracks):
-        raise ArgumentError("lines", f"is a {type(lines).__name__}", "eg.LineTracks(...)")
-    if lines.view.max() >= reconstruction.n_views:
-        was = f"name view {lines.view.max()}"
-        raise ArgumentError("lines", was, f"views 0 to {reconstruction.n_views - 1}")
+    lines = checked_lines(lines, reconstruction.n_views)
     model = camera_model(reconstruction.cameras.model)
     ends, spread, prefix = lines.segments.T, lines.spread.T / unit**2, model.prefix
     if f"{prefix}_line_residual" in SIGNATURES:

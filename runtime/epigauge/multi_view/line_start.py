@@ -1,29 +1,37 @@
-"""Lines from segments in calibrated views whose cameras are known."""
+"""Lines from segments in views whose cameras are known."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import kernels
-from epigauge.bundle.lines import LineLinearizer, Segments, unit_lines
+from epigauge.bundle.lines import LineLinearizer, Segments, sized_lines
+from epigauge.bundle.moves import best_conditioned
 from epigauge.bundle.run import REFINEMENT_METRIC
-from epigauge.bundle.similarity import normal_frame
-from epigauge.cameras import MetricReconstruction, camera_model
+from epigauge.cameras import CameraModel, MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
+from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.line_agreement import agreeing, lengths, meets, usual
-from epigauge.multi_view.line_segments import segments_of
+from epigauge.multi_view.line_segments import (
+    checked_lines,
+    frame_of,
+    projective_segments,
+    segments_of,
+)
 from epigauge.multi_view.line_tracks import LineTracks
+from epigauge.multi_view.reconstruction import Reconstruction
 
 __all__ = [
     "OPEN",
     "ROUNDING",
-    "checked_scene",
+    "SeenLines",
     "refuse_absurd",
+    "seen_lines",
     "spreads",
     "triangulate_lines",
     "triangulated",
@@ -43,8 +51,79 @@ ROUNDING = 1e-11
 _ABSURD, _FAR = 20.0, 0.05
 
 
+class SeenLines(NamedTuple):
+    """Segments and the cameras that see them, as the engine takes both.
+
+    Attributes
+    ----------
+    model : CameraModel
+        The camera.
+    cameras, points : ndarray, shape (n, c), (m, b)
+        Cameras, and the points of the scene.
+    segments : Segments
+        The observations.
+    scale_px : float
+        Pixels a unit of the image coordinates.
+    n_lines : int
+        Number of lines.
+    """
+
+    model: CameraModel
+    cameras: Array
+    points: Array
+    segments: Segments
+    scale_px: float
+    n_lines: int
+
+    def linearizer(self, table: Table) -> LineLinearizer:
+        """Return what evaluates the segments."""
+        sizes = len(self.cameras), self.n_lines
+        return LineLinearizer.of(self.segments, self.model, table, sizes)
+
+
+def seen_lines(
+    name: str, lines: LineTracks, scene: Any, unit: float = 1.0, frame: Frame | None = None
+) -> SeenLines:
+    """Return segments and the cameras of a scene.
+
+    Parameters
+    ----------
+    name : str
+        What the scene is called where it is refused.
+    lines : LineTracks
+        The segments.
+    scene : MetricReconstruction or Reconstruction
+        The cameras.
+    unit : float
+        Standard deviation of an image coordinate of weight one.
+    frame : Frame, optional
+        Image coordinates of projective cameras to compute in; else some that suit the segments.
+
+    Raises
+    ------
+    ArgumentError
+        On other scenes, views that have no camera, or end points without direction.
+    """
+    if isinstance(scene, MetricReconstruction):
+        model = camera_model(scene.cameras.model)
+        segments = segments_of(lines, scene, unit)
+        return SeenLines(model, scene.vectors, scene.X, segments, 1.0, lines.n_lines)
+    if not isinstance(scene, Reconstruction):
+        was = f"is a {type(scene).__name__}"
+        needed = "an eg.MetricReconstruction or eg.Reconstruction (to_projective), as lines need"
+        raise ArgumentError(name, was, needed)
+    lines = checked_lines(lines, scene.n_views)
+    frame = frame_of(lines, scene.n_views) if frame is None else frame
+    rows = frame.cameras_in(scene.P).reshape(-1, 12)
+    segments = projective_segments(lines, frame, unit)
+    model = camera_model("projective")
+    return SeenLines(model, rows, scene.Q, segments, frame.scale, lines.n_lines)
+
+
 def triangulate_lines(
-    lines: LineTracks, reconstruction: MetricReconstruction, backend: str | None = None
+    lines: LineTracks,
+    reconstruction: MetricReconstruction | Reconstruction,
+    backend: str | None = None,
 ) -> Array:
     """Return the lines that segments are images of, cameras being known.
 
@@ -56,8 +135,8 @@ def triangulate_lines(
     ----------
     lines : LineTracks
         Measured segments.
-    reconstruction : MetricReconstruction
-        The cameras.
+    reconstruction : MetricReconstruction or Reconstruction
+        The cameras; the points say where in space computing suits best.
     backend : {"c", "numpy", "casadi"}, optional
         Where the formulas are computed.
 
@@ -65,13 +144,14 @@ def triangulate_lines(
     -------
     ndarray, shape (L, 6)
         Pluecker coordinates (n, v): v the unit direction, n = X x v for every point X of the line.
+        With projective cameras the whole row has length one.
 
     Raises
     ------
     ArgumentError
         If lines are not determined, by their numbers: all planes are one within the noise, as of a
-        line in the plane of two centres (an epipolar plane), or the line is infinitely far. If
-        half of a line's segments are far from any one line.
+        line in the plane of two centres (an epipolar plane), or the line is infinitely far from
+        calibrated cameras. If half of a line's segments are far from any one line.
 
     Examples
     --------
@@ -80,22 +160,20 @@ def triangulate_lines(
     >>> eg.triangulate_lines(scene.line_tracks, scene.true).shape
     (60, 6)
     """
-    checked_scene("reconstruction", reconstruction)
     table = kernels.table(backend)
-    found, deviations = triangulated(lines, reconstruction, table)
+    seen = seen_lines("reconstruction", lines, reconstruction)
+    found, deviations = triangulated(seen, table)
     bad = np.flatnonzero(~(deviations <= OPEN))
     if len(bad):
         named = ", ".join(map(str, bad[:5])) + (", ..." if len(bad) > 5 else "")
         was = f"have {len(bad)} lines that their views do not determine: {named}"
         needed = "lines off the plane of the centres that see them (epipolar plane), not too far"
         raise ArgumentError("lines", was, needed)
-    refuse_absurd("lines", lines, reconstruction, found, table)
+    refuse_absurd("lines", seen, found, table)
     return found
 
 
-def refuse_absurd(
-    name: str, tracks: LineTracks, scene: MetricReconstruction, lines: Array, table: Table
-) -> None:
+def refuse_absurd(name: str, seen: SeenLines, lines: Array, table: Table) -> None:
     """Refuse lines that half of their segments are absurdly far from, beside what is usual.
 
     Raises
@@ -103,14 +181,12 @@ def refuse_absurd(
     ArgumentError
         Naming the lines.
     """
-    segments = segments_of(tracks, scene)
-    model, count = camera_model(scene.cameras.model), (scene.n_views, tracks.n_lines)
-    linearizer = LineLinearizer.of(segments, model, table, count)
-    sizes = lengths(linearizer, scene.vectors, lines)
-    pixels = sizes * np.sqrt(segments.spread[[0, 2, 3, 5]].mean(axis=0))
+    segments, line = seen.segments, seen.segments.line
+    sizes = lengths(seen.linearizer(table), seen.cameras, lines)
+    distances = sizes * np.sqrt(segments.spread[[0, 2, 3, 5]].mean(axis=0))
     extent = float(np.ptp(segments.ends.reshape(2, 2, -1), axis=(0, 2)).max())
-    far = (sizes > _ABSURD * usual(sizes)) & (pixels > _FAR * extent)
-    half = 2 * np.bincount(tracks.line, far, minlength=count[1]) >= np.bincount(tracks.line)
+    far = (sizes > _ABSURD * usual(sizes)) & (distances > _FAR * extent)
+    half = 2 * np.bincount(line, far, minlength=seen.n_lines) >= np.bincount(line)
     bad = np.flatnonzero(half)
     if len(bad):
         named = ", ".join(map(str, bad[:5])) + (", ..." if len(bad) > 5 else "")
@@ -119,26 +195,16 @@ def refuse_absurd(
         raise ArgumentError(name, was, "segments of one line each, and no start far from them")
 
 
-def checked_scene(name: str, scene: Any) -> None:
-    """Check that an argument is a scene of calibrated cameras."""
-    if not isinstance(scene, MetricReconstruction):
-        was = f"is a {type(scene).__name__}"
-        raise ArgumentError(name, was, "an eg.MetricReconstruction, as lines need")
-
-
-def triangulated(
-    lines: LineTracks, reconstruction: MetricReconstruction, table: Table
-) -> tuple[Array, Array]:
+def triangulated(seen: SeenLines, table: Table) -> tuple[Array, Array]:
     """Return lines (L, 6), and the largest standard deviation of each one's update, (L,)."""
-    segments = segments_of(lines, reconstruction)
-    home = normal_frame(reconstruction.vectors, reconstruction.X)
-    cameras, _ = home.apply(reconstruction.vectors, reconstruction.X)
-    planes = _planes(segments, cameras)
-    first = unit_lines(_nearest(planes, segments.line, lines.n_lines))
+    home, cameras, _ = best_conditioned(seen.model, seen.cameras, seen.points)
+    planes = _planes(seen.segments, cameras)
+    with np.errstate(all="ignore"):
+        nearest = _nearest(planes, seen.segments.line, seen.n_lines)
+        first = sized_lines(nearest, seen.model)
     bad = ~np.isfinite(first).all(axis=1)
     first[bad] = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-    model, sizes = camera_model(reconstruction.cameras.model), (len(cameras), lines.n_lines)
-    linearizer = LineLinearizer.of(segments, model, table, sizes)
+    linearizer = seen.linearizer(table)
     refined, _ = linearizer.refine_points(cameras, first, REFINEMENT_METRIC)
     agree, refined = agreeing(linearizer, planes, cameras, refined)
     if not agree.all():
@@ -147,7 +213,7 @@ def triangulated(
     J = linearizer.observe(cameras, refined)[2] * agree
     deviations = spreads(linearizer.graph.sum_points(np.einsum("ikn,iln->nkl", J, J)))
     deviations[bad | ~np.isfinite(refined).all(axis=1)] = np.inf
-    return home.inverse().lines(refined), deviations
+    return linearizer.carried(home.inverse(), refined), deviations / seen.scale_px
 
 
 def spreads(V: Array) -> Array:
@@ -160,20 +226,22 @@ def spreads(V: Array) -> Array:
 
 
 def _planes(segments: Segments, cameras: Array) -> Array:
-    """Return the planes of segments and centres, their normals of length one, (N, 4)."""
+    """Return the planes of segments and centres, their normals of length one, (N, 4).
+
+    In a projective basis, where a plane may be infinitely far, the planes themselves are.
+    """
     rows = segments.cameras(cameras).T
-    pose = rows[:, :12].reshape(-1, 3, 4)
-    k = rows[:, 12:]
-    fx, fy = k[:, 0], k[:, 1] if k.shape[1] == 4 else k[:, 0]
-    cx, cy = k[:, -2], k[:, -1]
     x1, y1, x2, y2 = segments.ends
-    ones = np.ones(len(rows))
-    a = np.stack([(x1 - cx) / fx, (y1 - cy) / fy, ones], axis=1)
-    b = np.stack([(x2 - cx) / fx, (y2 - cy) / fy, ones], axis=1)
-    normal = np.cross(a, b)
-    planes = np.einsum("nij,ni->nj", pose, normal)
+    ones, k = np.ones(len(rows)), rows[:, 12:]
+    if k.shape[1]:
+        fx, fy = k[:, 0], k[:, 1] if k.shape[1] == 4 else k[:, 0]
+        cx, cy = k[:, -2], k[:, -1]
+        x1, y1, x2, y2 = (x1 - cx) / fx, (y1 - cy) / fy, (x2 - cx) / fx, (y2 - cy) / fy
+    image = np.cross(np.stack([x1, y1, ones], axis=1), np.stack([x2, y2, ones], axis=1))
+    planes = np.einsum("nij,ni->nj", rows[:, :12].reshape(-1, 3, 4), image)
     # The normal of a plane has the direction of space; the scene has the size of about one.
-    return np.asarray(planes / np.linalg.norm(planes[:, :3], axis=1, keepdims=True))
+    size = planes[:, :3] if k.shape[1] else planes
+    return np.asarray(planes / np.linalg.norm(size, axis=1, keepdims=True))
 
 
 def _nearest(planes: Array, line: Indices, count: int) -> Array:

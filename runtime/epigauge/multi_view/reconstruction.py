@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 #: Size of a camera or a point, its largest entry: products of others overflow.
 MIN_SIZE, MAX_SIZE = 1e-100, 1e100
 
+#: How far the product of n and v of a line of length one may be from zero.
+_ORTHOGONAL = 1e-8
+
 
 class ReconstructionBase(Result):
     """Cameras and points of any kind."""
@@ -101,6 +104,10 @@ class Reconstruction(ReconstructionBase):
         Cameras, to pixels.
     Q : ndarray, shape (m, 4)
         Homogeneous points.
+    lines : ndarray, shape (L, 6), or None
+        Lines as Pluecker coordinates (n, v), stored with length one: of the line through the points
+        (a, 1) and (b, 1) v = b - a and n = a x v. Those at infinity have v = 0. None where there is
+        no line.
 
     Examples
     --------
@@ -112,10 +119,14 @@ class Reconstruction(ReconstructionBase):
 
     P: Array
     Q: Array
+    lines: Array | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "P", _homogeneous("P", self.P, (3, 4)))
         object.__setattr__(self, "Q", _homogeneous("Q", self.Q, (4,)))
+        if self.lines is not None:
+            lines = _lines_of_length_one(_homogeneous("lines", self.lines, (6,)))
+            object.__setattr__(self, "lines", lines if len(lines) else None)
 
     @property
     def n_views(self) -> int:
@@ -128,7 +139,8 @@ class Reconstruction(ReconstructionBase):
         return len(self.Q)
 
     def _heading(self) -> str:
-        return f"Reconstruction: {len(self.P)} views, {len(self.Q)} points"
+        lines = "" if self.lines is None else f", {len(self.lines)} lines"
+        return f"Reconstruction: {len(self.P)} views, {len(self.Q)} points{lines}"
 
     def _summary_rows(self) -> dict[str, str]:
         return {"cameras": "projective, known up to a change of basis"}
@@ -155,6 +167,19 @@ class Reconstruction(ReconstructionBase):
         h = np.einsum("nij,nj->ni", self.P[tracks.view], self.Q[tracks.point])
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             return np.asarray(h[:, :2] / h[:, 2:])
+
+
+def _lines_of_length_one(rows: Array) -> Array:
+    """Return Pluecker coordinates of length one, n and v being orthogonal."""
+    unit = rows / np.abs(rows).max(axis=1, keepdims=True)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    # Those of length one stay as they are, to the last bit.
+    rows = np.where(np.abs(np.sum(rows**2, axis=1, keepdims=True) - 1.0) > 1e-12, unit, rows)
+    bad = np.flatnonzero(np.abs(np.sum(rows[:, :3] * rows[:, 3:], axis=1)) > _ORTHOGONAL)
+    if len(bad):
+        was = f"is no line in row {bad[0]}: n and v are not orthogonal"
+        raise ArgumentError("lines", was, "n = a x v and v = b - a of points a and b")
+    return np.asarray(rows)
 
 
 def _homogeneous(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:

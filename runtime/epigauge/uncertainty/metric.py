@@ -25,7 +25,7 @@ from epigauge.bundle.solve import BundleSystem
 from epigauge.cameras import MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
-from epigauge.multi_view.line_adjust import line_job
+from epigauge.multi_view.line_adjust import line_problem
 from epigauge.multi_view.line_tracks import LineTracks
 from epigauge.multi_view.tracks import Tracks
 from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
@@ -178,8 +178,9 @@ def _of_lines(
     if scene.lines is None:
         was = "is given, and the reconstruction has no lines"
         raise ArgumentError("lines", was, "what was adjusted: eg.bundle_adjust(..., lines=lines)")
-    made = line_job(tracks, scene, lines, table, embedded=False, **free)[0]
-    job, at = made.job, made.start
+    made = line_problem(tracks, scene, lines, table, **free)
+    job, at, home = made.job, made.start, made.home
+    assert isinstance(home, Similarity)
     graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
     parts = job.model, table, graph, job.q, np.asarray(tracks.weights), Loss()
     (of_lines,) = made.problem.kinds
@@ -196,7 +197,7 @@ def _of_lines(
         return Motions.along_gauge(system, None, *whole.generators(at.cameras, rows))
 
     weights = whole.weights
-    return _Network(made.home, Estimate(at.cameras, rows), weights, None, normal, motions)
+    return _Network(home, Estimate(at.cameras, rows), weights, None, normal, motions)
 
 
 def redundancy_of(

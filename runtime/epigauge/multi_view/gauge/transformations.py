@@ -16,7 +16,7 @@ from epigauge.errors import ArgumentError
 from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.rotations import as_rotation
 
-__all__ = ["Gauge", "Transformation", "similarity", "transform"]
+__all__ = ["Gauge", "Transformation", "moved_lines", "similarity", "transform"]
 
 Array = NDArray[np.float64]
 
@@ -64,6 +64,21 @@ class Transformation:
         """
         cameras = self.camera_scales[:, None, None] * (P @ self.T)
         return cameras, self.point_scales[:, None] * np.linalg.solve(self.T, Q.T).T
+
+    def lines(self, lines: Array) -> Array:
+        """Move lines.
+
+        Parameters
+        ----------
+        lines : ndarray, shape (L, 6)
+            Pluecker coordinates (n, v).
+
+        Returns
+        -------
+        ndarray, shape (L, 6)
+            Of length one.
+        """
+        return moved_lines(np.asarray(np.linalg.inv(self.T)), lines)
 
     def inverse(self) -> Transformation:
         """Return the transformation back.
@@ -119,6 +134,12 @@ class Gauge(Protocol):
         Transformation
             For this reconstruction.
         """
+
+
+def moved_lines(T: Array, lines: Array) -> Array:
+    """Return lines (L, 6) where points are moved to T X, their coordinates of length one."""
+    moved = kernels.table("numpy").line_transform(T[..., None], lines.T).T
+    return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
 
 
 def similarity(s: float, R: ArrayLike, t: ArrayLike) -> Similarity:
@@ -250,9 +271,9 @@ def transform(
         if not np.isfinite(array).all() or (array == 0.0).any():
             raise ArgumentError(name, "has a zero or is not finite", "finite factors, none zero")
         scales.append(array)
-    return Reconstruction(
-        *Transformation(matrix, *scales).apply(reconstruction.P, reconstruction.Q)
-    )
+    move, lines = Transformation(matrix, *scales), reconstruction.lines
+    P, Q = move.apply(reconstruction.P, reconstruction.Q)
+    return Reconstruction(P, Q, None if lines is None else move.lines(lines))
 
 
 def _no_scales(kind: str, camera_scales: ArrayLike, point_scales: ArrayLike) -> None:
