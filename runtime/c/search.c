@@ -412,34 +412,6 @@ static void plane_and_parallax(search_t *s)
     s->score = score(s, s->F);
 }
 
-/* Share of the matches near one in either image that are near it in both: right matches have
-   neighbours that move alike. Near is within `reach` in each coordinate, in single precision.
-   Returns 0 where memory ran out. */
-EG_EXPORT int eg_neighbours(ptrdiff_t m, const double *q, double reach, double *share)
-{
-    const float limit = (float)reach;
-    float *x1 = malloc((size_t)(4 * m + 1) * sizeof *x1), *y1 = x1 + m, *x2 = y1 + m, *y2 = x2 + m;
-    if (!x1)
-        return 0;
-    for (ptrdiff_t i = 0; i < 4 * m; ++i)
-        x1[i] = (float)q[i];
-    for (ptrdiff_t i = 0; i < m; ++i) {
-        const float a = x1[i], b = y1[i], c = x2[i], d = y2[i];
-        int one = 0, two = 0, both = 0;
-        EG_SUM(one, two, both)
-        for (ptrdiff_t j = 0; j < m; ++j) {
-            const int first = (fabsf(x1[j] - a) < limit) & (fabsf(y1[j] - b) < limit);
-            const int second = (fabsf(x2[j] - c) < limit) & (fabsf(y2[j] - d) < limit);
-            one += first;
-            two += second;
-            both += first & second;
-        }
-        share[i] = ((double)both - 1.0) / ((double)(one + two) - 1.0);
-    }
-    free(x1);
-    return 1;
-}
-
 /* Spread over the better half of the matches. */
 static void choose_judges(search_t *s, const ptrdiff_t *order)
 {

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from epigauge import kernels
 from epigauge.two_view.conditioning import condition
-from epigauge.two_view.search import ranked, search
+from epigauge.two_view.neighbours import accord, ranked
+from epigauge.two_view.search import search
 from two_views import algebraic
 
 NUMPY = kernels.table("numpy")
@@ -83,6 +84,50 @@ def test_wrong_matches_of_repeated_structure_do_not_move_a_facade(seed):
     assert np.sqrt(np.mean(errors**2)) < 0.3
     assert np.mean(result.inlier[:300]) > 0.9
     assert result.start == "native"
+
+
+def windows(seed, off=30, on=200, shifted=90, wrong=200):
+    """Return matches of a wall, of points before it, of windows of one row that are taken for each
+    other, and wrong ones; and noise-free right ones."""
+    rng = np.random.default_rng(seed)
+    wall = np.column_stack([rng.uniform(-3, 3, on), rng.uniform(-2, 2, on), np.full(on, 6.0)])
+    free = np.column_stack([rng.uniform(1, 2, off), rng.uniform(0, 1, off), np.full(off, 4.5)])
+    free += rng.uniform(-0.2, 0.2, free.shape)
+    x1, x2, true1, true2 = projected(np.concatenate([wall, free]), rng)
+    rows = rng.integers(0, on, shifted)
+    other = wall[rows] + [1.0, 0.0, 0.0] * rng.choice([-2.0, -1.0, 1.0, 2.0], (shifted, 1))
+    more1, more2 = projected(wall[rows], rng)[0], projected(other, rng)[1]
+    noise1, noise2 = rng.uniform(0.0, 1000.0, (2, wrong, 2))
+    x1, x2 = np.concatenate([x1, more1, noise1]), np.concatenate([x2, more2, noise2])
+    return x1, x2, true1, true2
+
+
+# The F of their row agrees with more matches than the scene's
+@pytest.mark.parametrize("seed", range(3))
+def test_windows_taken_for_others_of_their_row_do_not_outvote_the_scene(seed):
+    x1, x2, true1, true2 = windows(seed)
+    result = eg.estimate_fundamental(x1, x2)
+    assert np.median(np.abs(eg.reprojection_distances(result.F, true1, true2)[0][200:])) < 1.0
+    assert np.mean(result.inlier[200:230]) > 0.8
+    row = eg.estimate_fundamental(x1[: 230 + 90][np.r_[:200, 230:320]], x2[np.r_[:200, 230:320]])
+    assert np.count_nonzero(row.inlier) > 270 > np.count_nonzero(result.inlier)
+
+
+def test_accord_is_the_share_of_neighbours_in_both_images():
+    rng = np.random.default_rng(0)
+    q1 = rng.uniform(-1.7, 1.7, (2, 150))
+    q2 = q1 + 0.1 * rng.standard_normal(q1.shape)
+    q2[:, :30] = rng.uniform(-1.7, 1.7, (2, 30))
+    q2[:, 149] = 9.0
+    q1[:, 149] = 9.0
+    near1, near2 = (np.abs(q[:, :, None] - q[:, None]).max(axis=0) < 0.3 for q in (q1, q2))
+    both = np.count_nonzero(near1 & near2, axis=1) - 1
+    expected = (both + 0.5) / np.count_nonzero(near1 | near2, axis=1)
+    for table in (NUMPY, compiled()):
+        found = accord(table, np.asfortranarray(q1), q2)
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert expected[149] == 0.5
+    assert expected[:30].mean() < 0.2 < expected[30:149].mean()
 
 
 # Any F of the plane fits nearly all; a sample of seven avoids it with two or more off it alone.

@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import itertools
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +18,13 @@ from epigauge.two_view.chance import SIGNIFICANT, chance_agreement, log10_false_
 from epigauge.two_view.conditioning import RMS
 from epigauge.two_view.consensus import Agreement, Consensus
 from epigauge.two_view.initial import fundamental_8point
-from epigauge.two_view.search import SCALES, ranked, search
+from epigauge.two_view.neighbours import accord, ranked
+from epigauge.two_view.search import SCALES, search
 
 __all__ = ["checked", "start"]
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
 
 #: Other packages work in coordinates of this RMS, as an image has: OpenCV computes in float32.
 _PIXELS = 250.0 / RMS
@@ -44,6 +47,15 @@ _EXTENT = 20.0
 
 #: An F found sharply among matches whose noise is up to so many scales may climb to a sharp one.
 _BLUNT = 4.0
+
+#: Of the matches within so many scales of a sharp F, those that move with less than this share of
+#: their neighbours may be of repeated structure. Where a larger share is, all are left out, and
+#: what the others agree on is compared.
+_NEAR, _ASTRAY, _REPEATED = 2.0, 0.3, 0.2
+
+#: That is better where matches move with their neighbours by so much more in all, and those that
+#: only it explains by so much more each than those that only the other does.
+_GAIN, _BETTER = 1.05, 1.2
 
 #: Right matches that are more than those which fit by chance.
 _ENOUGH = 14
@@ -132,7 +144,7 @@ def _native(
         if scale == SCALES[0] and q1.shape[1] >= _MANY:
             sharp = consensus.judge(found.F, scale, extent=_EXTENT * scale)
             if _is_sharp(kernels, q1, q2, sharp, sharp.signed[few], scale):
-                return sharp
+                return _Repeats(consensus, kernels, q1, q2, scale).avoided(sharp, order, seed)
             if sharp.sigma <= _BLUNT * scale:
                 climbed = consensus.climb(consensus.judge(found.F, scale))
                 own = max(scale, climbed.sigma)
@@ -164,6 +176,55 @@ def _is_sharp(
         return False
     chance = chance_agreement(kernels, found.F, q1, q2, limit)
     return log10_false_alarms(q1.shape[1], int(hits) + 7, chance) <= SIGNIFICANT
+
+
+@dataclass(frozen=True)
+class _Repeats:
+    """Repeated structure among conditioned matches, which may agree with an F of its own.
+
+    The likelihood of that F may be higher than that of the scene's: wrong matches are not uniform
+    there. So of two F the one counts whose matches move with their neighbours.
+    """
+
+    consensus: Consensus
+    kernels: Table
+    q1: Array
+    q2: Array
+    scale: float
+
+    def avoided(self, found: Agreement, order: Rows, seed: int) -> Agreement:
+        """Return what matches agree on without those of repeated structure, if that is better."""
+        rows, accords = self.near(found)
+        astray = rows[accords < _ASTRAY]
+        if len(astray) <= _REPEATED * len(rows):
+            return found
+        kept = np.ones(self.q1.shape[1], np.bool_)
+        kept[astray] = False
+        if np.count_nonzero(kept) < _ENOUGH:
+            return found
+        one, two = (np.ascontiguousarray(q[:, kept]) for q in (self.q1, self.q2))
+        among = (np.cumsum(kept) - 1)[order[kept[order]]]
+        other = search(self.kernels, one, two, among, seed=seed, scale=self.scale)
+        if not other.score > 0.0:
+            return found
+        trial = self.consensus.judge(other.F, self.scale, extent=_EXTENT * self.scale)
+        there, again = self.near(trial)
+        lost, won = accords[~np.isin(rows, there)], again[~np.isin(there, rows)]
+        # Squared: many that go astray add little. Where a plane alone is left, all on it move
+        # alike, but what is won by chance is no better than what is lost.
+        better = np.sum(again**2) > _GAIN * np.sum(accords**2)
+        return trial if better and _mean(won) > _BETTER * _mean(lost) else found
+
+    def near(self, found: Agreement) -> tuple[Rows, Array]:
+        """Return the rows of the matches that agree, and how far each moves with the others."""
+        few = self.consensus.few
+        d = np.where(found.oriented[few], np.abs(found.signed[few]), np.inf)
+        rows = np.flatnonzero(d <= _NEAR * self.scale)
+        return rows, accord(self.kernels, self.q1[:, rows], self.q2[:, rows])
+
+
+def _mean(values: Array) -> float:
+    return float(np.sum(values)) / max(len(values), 1)
 
 
 def _of_package(

@@ -33,8 +33,9 @@ from epigauge.two_view.homography_refine import (
     with_flags,
 )
 from epigauge.two_view.homography_result import HomographyResult
+from epigauge.two_view.neighbours import ranked
 from epigauge.two_view.robust import of_matches
-from epigauge.two_view.search import SCALES, ranked
+from epigauge.two_view.search import SCALES
 
 __all__ = ["PlaneMixture", "estimate_homography"]
 

@@ -197,6 +197,11 @@ def estimate_fundamental(
     from 8-point estimates of random subsets of the inliers, until that finds nothing higher.
     Matches that violate the oriented epipolar constraint count as wrong.
 
+    Windows of a facade that are taken for others of their row agree with an F of their own, whose
+    epipole is the vanishing point of the row: more of them than there are matches off the wall. But
+    they move otherwise than their neighbours. Where many that agree do, the search is made again
+    without them, and the F counts whose matches move with their neighbours.
+
     References
     ----------
     .. [1] D. Barath, J. Noskova, M. Ivashechkin, J. Matas, "MAGSAC++, a fast, reliable and accurate

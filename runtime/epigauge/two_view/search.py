@@ -43,7 +43,7 @@ from epigauge.two_view.eliminated import EliminatedProblem
 from epigauge.two_view.losses import Loss, median
 from epigauge.two_view.parameterizations import Ortho
 
-__all__ = ["SCALES", "Found", "ranked", "search"]
+__all__ = ["SCALES", "Found", "search"]
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -81,9 +81,6 @@ _BATCH, _JUDGES, _FINALISTS = 64, 192, 6
 #: Shares of the matches, best first, that samples are drawn from in turns.
 _POOLS = (1.0, 0.5, 0.25, 0.125)
 
-#: Matches are near within this in each coordinate: 3 % of the image.
-_REACH = 0.2
-
 
 class _Options(ctypes.Structure):
     _fields_ = (
@@ -97,13 +94,12 @@ class _Options(ctypes.Structure):
 
 
 @cache
-def _functions() -> tuple[Any, Any]:
+def _function() -> Any:
     check_sizes({"eg_search_options": _Options})
     pointer, size = ctypes.c_void_p, ctypes.c_ssize_t
-    find, near = library().eg_search, library().eg_neighbours
-    find.argtypes, find.restype = [size, *[pointer] * 5], size
-    near.argtypes = [size, pointer, ctypes.c_double, pointer]
-    return find, near
+    function = library().eg_search
+    function.argtypes, function.restype = [size, *[pointer] * 5], size
+    return function
 
 
 @dataclass(frozen=True)
@@ -126,31 +122,6 @@ class Found:
     score: float
     samples: int
     scale: float
-
-
-def ranked(kernels: Table, q1: Array, q2: Array) -> Rows:
-    """Return the rows of the matches, those first whose neighbours move alike.
-
-    Parameters
-    ----------
-    kernels : Table
-        Backend.
-    q1, q2 : ndarray, shape (2, m)
-        Conditioned matches.
-    """
-    q, m = np.concatenate([q1, q2]), q1.shape[1]
-    share = np.empty(m)
-    if kernels.compiled:
-        if not _functions()[1](m, address(q), _REACH, address(share)):
-            raise MemoryError(f"no room for {m} matches")
-    else:
-        q = q.astype(np.float32)
-        for i in range(m):
-            near = np.abs(q - q[:, i : i + 1]) < np.float32(_REACH)
-            one, two = near[0] & near[1], near[2] & near[3]
-            both, ends = np.count_nonzero(one & two), np.count_nonzero(one) + np.count_nonzero(two)
-            share[i] = (both - 1.0) / (ends - 1.0)
-    return np.argsort(-share, kind="stable")
 
 
 def search(
@@ -190,7 +161,7 @@ def search(
     options = _Options(*numbers, scale, _FLOOR, _PATIENCE, width, _DOMINANT)
     order = None if order is None else np.ascontiguousarray(order, dtype=np.intp)
     F, score = np.zeros((3, 3)), np.zeros(1)
-    samples = _functions()[0](
+    samples = _function()(
         m, address(q), address(order), ctypes.addressof(options), address(F), address(score)
     )
     if samples < 0:
