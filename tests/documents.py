@@ -34,6 +34,9 @@ from epigauge.errors import MissingPackageError
 CHECKOUT = Path(__file__).resolve().parents[1]
 PICTURES = CHECKOUT / "docs" / "pictures"
 
+#: Bytes of a picture, so that pages load on a phone.
+LARGEST = 250_000
+
 #: Commands that take minutes; their results are in the documentation.
 LONG = ("reproduce",)
 #: Shown between two matches of the text around it.
@@ -180,7 +183,18 @@ def main(names: list[str]) -> None:
             for name in pictures(page):
                 if Path(folder, name).is_file():
                     shutil.copyfile(Path(folder, name), PICTURES / name)
+                    shrink(PICTURES / name)
                     print(f"{page}: {name}")
+
+
+def shrink(picture: Path) -> None:
+    """Keep a picture above `LARGEST` in 256 colours: a third of the size, and hardly to be seen."""
+    from PIL import Image
+
+    if picture.stat().st_size > LARGEST:
+        with Image.open(picture) as opened:
+            few = opened.convert("RGB").quantize(method=Image.Quantize.MAXCOVERAGE)
+        few.save(picture, optimize=True)
 
 
 if __name__ == "__main__":

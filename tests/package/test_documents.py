@@ -109,6 +109,15 @@ def test_every_block_is_of_a_kind_that_is_known(page: Path) -> None:
     assert not re.search(r"^```\{code", page.read_text(), re.MULTILINE)  # it would not be run
 
 
+def test_pictures_load_on_a_phone() -> None:
+    large = {
+        path.name: path.stat().st_size
+        for path in documents.PICTURES.iterdir()
+        if path.stat().st_size > documents.LARGEST
+    }
+    assert large == {}
+
+
 def test_links_of_the_readme_lead_to_files() -> None:
     """Those of the other pages are checked when the documentation is built."""
     targets = re.findall(r"\]\(([^)\s#]+)", (documents.CHECKOUT / "README.md").read_text())
