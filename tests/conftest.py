@@ -1,4 +1,7 @@
-"""What all tests share: the real data, the command line, and that Ctrl-C can be tested."""
+"""What all tests share: the real data, the command line, and that Ctrl-C can be tested.
+
+Here stands, too, which of them need not run in every environment of the matrix.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +43,29 @@ PAIRS = (
     "templeSR_1_2",
     "templeSR_9_10",
 )
+
+#: Tests of files, commands, pages and pictures. Their numbers come from functions that have tests
+#: of their own, so another back end or another way of installing changes nothing here.
+#: test_cli.py is not among them: it runs everywhere.
+SURFACE = (
+    *("package/test_distribution.py", "package/test_documents.py", "package/test_metadata.py"),
+    *("package/test_newcomer.py", "runtime/test_benchmarks.py", "runtime/test_cli_*.py"),
+    *("runtime/test_colmap.py", "runtime/test_colmap_hostile.py", "runtime/test_datasets.py"),
+    *("runtime/test_database_executors.py", "runtime/test_display.py", "runtime/test_fuzz.py"),
+    *("runtime/test_images.py", "runtime/test_interop.py", "runtime/test_io*.py"),
+    *("runtime/test_line_files.py", "runtime/test_match_files.py", "runtime/test_pages_*.py"),
+    *("runtime/test_pair_pictures.py", "runtime/test_plots.py", "runtime/test_precision_plot.py"),
+    *("runtime/test_reproduce*.py", "runtime/test_samples.py", "runtime/test_scene_files.py"),
+    "runtime/test_viewer.py",
+)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what `SURFACE` names, before ``-m`` chooses."""
+    for item in items:
+        if any(fnmatch(item.path.as_posix(), f"*/{name}") for name in SURFACE):
+            item.add_marker("surface")
 
 
 def pytest_configure() -> None:
