@@ -8,6 +8,13 @@
    a pair of views stay longer in the fast cache; with fewer the factors do. */
 #define EG_GROUP 32768
 
+/* Pairs of observations of one row of the envelope, with those of a column, that wait to be added up
+   together: numbers in the group, of the column's and the row's one. */
+#define EG_WAITING 24
+typedef struct {
+    int32_t count, pair[2 * EG_WAITING];
+} eg_waiting;
+
 struct eg_group {
     ptrdiff_t lanes, count; /* that hold a point; observations */
     double *turned;         /* so many doubles an observation as its route says */
@@ -15,6 +22,8 @@ struct eg_group {
     int32_t *first;         /* first observation of each lane, and the end */
     int32_t *view, *lane;   /* of each observation */
     int32_t *end, *sorted;  /* scratch: an entry a view and two more; one an observation */
+    eg_waiting *waiting;    /* of the direct route: an entry a view, all of them empty */
+    int32_t *columns;       /* and one a view */
 };
 
 /* Lay out the lanes of a chunk behind those there are. */
@@ -58,7 +67,8 @@ static inline int eg_group_begin(eg_group *group, const eg_bundle *b, const eg_r
     const ptrdiff_t rows = eg_group_most(b, route, begin, end, b->rows);
     const ptrdiff_t lanes = eg_group_most(b, route, begin, end, b->lanes);
     const ptrdiff_t moments = route->factored ? 16 * lanes : 0;
-    const ptrdiff_t whole = 3 * rows + lanes + 1 + b->n_views + 2;
+    const ptrdiff_t each = route->factored ? 0 : 1 + (ptrdiff_t)(sizeof *group->waiting / sizeof(int32_t));
+    const ptrdiff_t whole = 3 * rows + lanes + 1 + b->n_views + 2 + each * b->n_views;
     group->turned = eg_aligned(route->turned * rows + moments + (whole + 1) / 2);
     group->moments = group->turned + route->turned * rows;
     group->view = (int32_t *)(group->moments + moments);
@@ -66,13 +76,41 @@ static inline int eg_group_begin(eg_group *group, const eg_bundle *b, const eg_r
     group->sorted = group->lane + rows;
     group->first = group->sorted + rows;
     group->end = group->first + lanes + 1;
-    return !group->turned;
+    group->columns = group->end + b->n_views + 2;
+    group->waiting = (eg_waiting *)(group->columns + b->n_views);
+    if (!group->turned)
+        return 1;
+    for (ptrdiff_t i = 0; !route->factored && i < b->n_views; ++i)
+        group->waiting[i].count = 0;
+    return 0;
 }
 
 static inline void eg_group_clear(eg_group *group)
 {
     group->lanes = group->count = 0;
     group->first[0] = 0;
+}
+
+/* The observations of a group view by view. Returns the lowest view, and the highest by its
+   address; `end` becomes the end of each view's. */
+static inline int32_t eg_sort_by_view(eg_group *group, int32_t *highest)
+{
+    const int32_t *EG_RESTRICT view = group->view;
+    int32_t *EG_RESTRICT end = group->end, *EG_RESTRICT sorted = group->sorted;
+    int32_t low = view[0], high = low;
+    for (ptrdiff_t r = 0; r < group->count; ++r) {
+        low = view[r] < low ? view[r] : low;
+        high = view[r] > high ? view[r] : high;
+    }
+    memset(end + low, 0, (size_t)(high + 2 - low) * sizeof *end);
+    for (ptrdiff_t r = 0; r < group->count; ++r)
+        ++end[view[r] + 1];
+    for (ptrdiff_t v = low; v <= high; ++v)
+        end[v + 1] += end[v];
+    for (ptrdiff_t r = 0; r < group->count; ++r)
+        sorted[end[view[r]]++] = (int32_t)r;
+    *highest = high;
+    return low;
 }
 
 #endif

@@ -18,8 +18,8 @@ void eg_factored_pairs_alike(const eg_pass *, const eg_envelope *, ptrdiff_t lan
 /* Widths of rows, up to EG_MOST_TANGENT. */
 #define EG_WIDTHS(CASE) CASE(8) CASE(12) CASE(16) CASE(20) CASE(24) CASE(32)
 
-/* Fill in `turn_cameras`, `add_cameras`, `turn_slot` and `pairs` of the direct route for its width;
-   in bundle_marginals.c: `marginal`. */
+/* Fill in what the direct route has for its width of rows: in bundle_products.c `turn_cameras`,
+   `add_cameras`, `turn_slot` and `pairs`, in bundle_marginals.c `marginal`. */
 void eg_direct_loops(eg_route *route);
 void eg_direct_marginal(eg_route *route);
 

@@ -25,6 +25,18 @@ typedef struct {
     double *reduced;
 } elimination;
 
+/* The lower triangles of the pairs of a view with itself, of which the direct route sums the upper. */
+static void mirror(const eg_route *route, const eg_envelope *envelope, double *pairs)
+{
+    const ptrdiff_t K = route->tangent, length = route->pair_sums.length;
+    for (ptrdiff_t i = 0; !route->factored && i < envelope->n; ++i) {
+        double *own = pairs + route->pair_sums.size * (envelope->slot[i + 1] - 1);
+        for (ptrdiff_t k = 0; k < K; ++k)
+            for (ptrdiff_t l = 0; l < k; ++l)
+                own[length * k + l] = own[length * l + k];
+    }
+}
+
 static void elimination_end(elimination *e, double *reduced)
 {
     const ptrdiff_t K = e->route.tangent, wide = e->route.padded;
@@ -87,6 +99,7 @@ int eg_bundle_schur(
         }
         e.route.pairs(&e.route, envelope, &e.group, pairs);
     }
+    mirror(&e.route, envelope, pairs);
     elimination_end(&e, reduced);
     return 0;
 }
@@ -139,6 +152,7 @@ int eg_bundle_eliminate(
         if (pairs)
             e.route.pairs(&e.route, envelope, &e.group, pairs);
     }
+    mirror(&e.route, envelope, pairs);
     elimination_end(&e, reduced);
     return status;
 }
