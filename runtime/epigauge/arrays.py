@@ -115,6 +115,18 @@ def constant(array: Any) -> Any:
     return array
 
 
+def bucket(array: Any, count: int) -> int:
+    """Return how long an axis of `count` entries is made, of what computes with an array.
+
+    JAX compiles each operation anew for each shape: there one of few lengths, 2^k
+    or 1.5 2^k. Others take any length.
+    """
+    if type(array).__module__.partition(".")[0] not in ("jax", "jaxlib"):
+        return count
+    whole = 1 << max(count - 1, 3).bit_length()
+    return 3 * whole // 4 if count <= 3 * whole // 4 else whole
+
+
 def device(array: Any) -> Any:
     """Return where an array lies, None for what JAX traces."""
     return getattr(array, "device", None)

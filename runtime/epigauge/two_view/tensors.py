@@ -115,7 +115,7 @@ def refined(
     once = np.ones(len(values[0])) if once is None else once
     reasons = refusals(*values, once, bounds)
     kept = np.array([k for k in range(count) if k not in reasons], np.intp)
-    rows, own = packed(bounds)
+    rows, own = packed(bounds, x1)
     nfev, status = np.zeros(count, np.intp), np.full(count, REFUSED, np.intp)
     fields = {"F": (3, 3), "sigma": (), "cost": (), "rms_px": ()}
     found: dict[str, Any] = {
@@ -123,25 +123,31 @@ def refined(
     }
     found["distances"] = convert(np.zeros(len(values[0])))
     if len(kept):
-        rows, own = rows[kept], own[kept]
+        # Pairs that fill up a bucket repeat the last: nobody reads them.
+        filling = arrays.bucket(x1, len(kept)) - len(kept)
+        refining = np.concatenate([kept, np.full(filling, kept[-1])])
+        rows, own = rows[refining], own[refining]
         place = xp.asarray(rows.ravel(), device=arrays.device(x1))
         own1, own2 = (xp.reshape(xp.take(x, place, axis=0), (*rows.shape, 2)) for x in (x1, x2))
         starts = (
-            None if F0 is None else xp.take(F0, xp.asarray(kept, device=arrays.device(x1)), axis=0)
+            None
+            if F0 is None
+            else xp.take(F0, xp.asarray(refining, device=arrays.device(x1)), axis=0)
         )
         minimum = refine_pairs(
             xp, own1, own2, convert(np.where(own, once[rows], 0.0)), starts, stopping
         )
         # Refused pairs, and their matches, read the zero that is appended.
-        pick = np.full(count, len(kept), np.intp)
+        pick = np.full(count, len(refining), np.intp)
         pick[kept] = np.arange(len(kept))
         for name in fields:
             value = getattr(minimum, name)
             found[name] = _taken(xp, value, pick)
         where = np.full(len(values[0]), rows.size, np.intp)
+        own[len(kept) :] = False
         where[rows[own]] = np.flatnonzero(own)
         found["distances"] = _taken(xp, xp.reshape(minimum.distances, (-1,)), where)
-        nfev[kept], status[kept] = minimum.nfev, minimum.status
+        nfev[kept], status[kept] = minimum.nfev[: len(kept)], minimum.status[: len(kept)]
     return found | {
         "nfev": nfev,
         "njev": nfev.copy(),
@@ -179,10 +185,13 @@ def refusals(
     return reasons
 
 
-def packed(bounds: Indices) -> tuple[Indices, NDArray[np.bool_]]:
-    """Return the rows of each pair, (n, m), padded by row 0, and which of them are its own."""
+def packed(bounds: Indices, x: Tensor) -> tuple[Indices, NDArray[np.bool_]]:
+    """Return the rows of each pair, (n, m), padded by row 0, and which of them are its own.
+
+    What `x` is of may ask for more padding.
+    """
     sizes = np.diff(bounds)
-    place = np.arange(int(sizes.max(initial=1)))
+    place = np.arange(arrays.bucket(x, int(sizes.max(initial=1))))
     own = place < sizes[:, None]
     return np.where(own, bounds[:-1, None] + place, 0), own
 
