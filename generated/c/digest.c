@@ -7,7 +7,7 @@
 
 const char *eg_digest(void)
 {
-    return "2d727184f1259a28";
+    return "a3a44d1c482dae90";
 }
 
 const char *eg_sources(void)

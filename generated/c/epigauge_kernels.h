@@ -1613,6 +1613,18 @@ EG_EXPORT void eg_epipole(
     const double *EG_RESTRICT F,
     double *EG_RESTRICT epipole);
 
+EG_EXPORT void eg_shared_focal(
+    ptrdiff_t n,
+    const double *EG_RESTRICT F,
+    const double *EG_RESTRICT c1,
+    const double *EG_RESTRICT c2,
+    const double *EG_RESTRICT f_array,
+    double *EG_RESTRICT difference,
+    double *EG_RESTRICT slope,
+    double *EG_RESTRICT curvature,
+    double *EG_RESTRICT J_F,
+    double *EG_RESTRICT J_c);
+
 EG_EXPORT void eg_dual_image_rows(
     ptrdiff_t n,
     const double *EG_RESTRICT P,
@@ -1634,6 +1646,14 @@ EG_EXPORT void eg_two_view_focals(
     double *EG_RESTRICT squares,
     double *EG_RESTRICT J_F,
     double *EG_RESTRICT J_c);
+
+EG_EXPORT void eg_three_points(
+    ptrdiff_t n,
+    const double *EG_RESTRICT cosines,
+    const double *EG_RESTRICT squares,
+    double *EG_RESTRICT quartic,
+    double *EG_RESTRICT above,
+    double *EG_RESTRICT below);
 
 /* A camera model: sizes of camera, update and point, and its kernels. */
 typedef struct {

@@ -4,6 +4,205 @@
 #include <math.h>
 #include <string.h>
 
+/* Formula: ((a - b) / (a + b))^2 of the squared singular values of E = K F K, zero where both
+   cameras have the focal length f (P. Sturm, 2001), with its first and second derivatives by
+   log f, and those of the first by vect(F) and both principal points.
+   Inputs:  F (3, 3), c1 (2,), c2 (2,), f ()
+   Outputs: difference (1,), slope (1,), curvature (1,), J_F (1, 9), J_c (1, 4)
+   Operations: 619, temporaries: 146. */
+EG_EXPORT void eg_shared_focal(
+    ptrdiff_t n,
+    const double *EG_RESTRICT F,
+    const double *EG_RESTRICT c1,
+    const double *EG_RESTRICT c2,
+    const double *EG_RESTRICT f_array,
+    double *EG_RESTRICT difference,
+    double *EG_RESTRICT slope,
+    double *EG_RESTRICT curvature,
+    double *EG_RESTRICT J_F,
+    double *EG_RESTRICT J_c)
+{
+    EG_SIMD
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double F00 = F[i];
+        const double F01 = F[n + i];
+        const double F02 = F[2*n + i];
+        const double F10 = F[3*n + i];
+        const double F11 = F[4*n + i];
+        const double F12 = F[5*n + i];
+        const double F20 = F[6*n + i];
+        const double F21 = F[7*n + i];
+        const double F22 = F[8*n + i];
+        const double c1_0 = c1[i];
+        const double c1_1 = c1[n + i];
+        const double c2_0 = c2[i];
+        const double c2_1 = c2[n + i];
+        const double f = f_array[i];
+        const double G00 = F00;
+        const double t11 = G00*G00;
+        const double G01 = F01;
+        const double t14 = G01*G01;
+        const double t22 = f*f*f*f;
+        const double t23 = f*f;
+        const double t0 = F02 + F00*c1_0 + F01*c1_1;
+        const double G02 = t0;
+        const double t9 = G02*G02;
+        const double t24 = t11*t22 + t14*t22 + t23*t9;
+        const double t2 = F20 + F00*c2_0 + F10*c2_1;
+        const double t3 = F21 + F01*c2_0 + F11*c2_1;
+        const double G22 = F22 + F02*c2_0 + F12*c2_1 + c1_0*t2 + c1_1*t3;
+        const double G20 = t2;
+        const double t4 = G20*G20;
+        const double G21 = t3;
+        const double t6 = G21*G21;
+        const double t25 = G22*G22 + t23*t4 + t23*t6;
+        const double t1 = F12 + F10*c1_0 + F11*c1_1;
+        const double G12 = t1;
+        const double t16 = G12*G12;
+        const double G10 = F10;
+        const double t18 = G10*G10;
+        const double G11 = F11;
+        const double t19 = G11*G11;
+        const double t26 = t16*t23 + t18*t22 + t19*t22;
+        const double t29 = G02*G22;
+        const double t12 = f*f*f;
+        const double t30 = G20*t12;
+        const double t31 = G21*t12;
+        const double t32 = G00*t30 + G01*t31 + f*t29;
+        const double t35 = G00*t22;
+        const double t36 = G01*G11;
+        const double t37 = G02*G12;
+        const double t38 = G10*t35 + t22*t36 + t23*t37;
+        const double t41 = G12*G22;
+        const double t42 = G10*t30 + G11*t31 + f*t41;
+        const double t43 = 2.0*t24*t24 + 2.0*t25*t25 + 2.0*t26*t26 + 4.0*t32*t32 + 4.0*t38*t38 + 4.0*t42*t42;
+        const double t27 = t24 + t25 + t26;
+        const double t46 = 1.0/(t27*t27);
+        const double t10 = 4.0*t9;
+        const double t13 = 8.0*t12;
+        const double t15 = f*t10 + t11*t13 + t13*t14;
+        const double t17 = 4.0*t16;
+        const double t20 = f*t17 + t13*t18 + t13*t19;
+        const double t5 = 4.0*t4;
+        const double t7 = 4.0*t6;
+        const double t8 = f*t5 + f*t7;
+        const double t21 = -t15 - t20 - t8;
+        const double t28 = 1.0/(t27*t27*t27);
+        const double t113 = t21*t28;
+        const double t50 = 6.0*t23;
+        const double t51 = G00*G20;
+        const double t52 = G21*t50;
+        const double t53 = 2.0*t29 + G01*t52 + t50*t51;
+        const double t55 = 4.0*t37;
+        const double t56 = G00*t13;
+        const double t57 = G10*t56 + f*t55 + t13*t36;
+        const double t63 = 2.0*t25;
+        const double t64 = 4.0*t32;
+        const double t65 = G10*G20;
+        const double t66 = 2.0*t41 + G11*t52 + t50*t65;
+        const double t67 = 4.0*t42;
+        const double t68 = 4.0*t38;
+        const double t69 = 2.0*t24;
+        const double t70 = 2.0*t26;
+        const double t71 = t15*t69 + t20*t70 + t53*t64 + t57*t68 + t63*t8 + t66*t67;
+        const double t114 = t113*t43 + t46*t71;
+        const double t105 = 4.0*t12;
+        const double t115 = t5 + t7;
+        const double t47 = 24.0*t23;
+        const double t116 = t10 + t11*t47 + t14*t47;
+        const double t117 = t17 + t18*t47 + t19*t47;
+        const double t118 = 6.0*f;
+        const double t119 = 12.0*t12;
+        const double t120 = 2.0*f;
+        const double t121 = 12.0*f;
+        const double t122 = G21*t121;
+        const double t123 = 3.0*t23;
+        const double t110 = G21*t23;
+        const double t124 = 3.0*t110;
+        const double t125 = G00*G10;
+        const double t44 = t28*t43;
+        const double t54 = 4.0*t53;
+        const double t58 = 4.0*t57;
+        const double t61 = t21*t43/(t27*t27*t27*t27);
+        const double t94 = 4.0*t66;
+        const double t33 = G20*t32;
+        const double t34 = G10*t22;
+        const double t39 = 8.0*t38;
+        const double t40 = 8.0*t24;
+        const double t45 = 16.0*t12*t44;
+        const double t48 = 32.0*t12;
+        const double t49 = t38*t48;
+        const double t59 = t24*t48;
+        const double t60 = 4.0*t15;
+        const double t62 = 6.0*t61;
+        const double t72 = t28*t71;
+        const double t73 = 4.0*t72;
+        const double along0 = f*(t46*(G00*t59 + G10*t49 + t30*t54 + t33*t47 + t34*t58 + t35*t60) + t21*t28*(t13*t33 + t34*t39 + t35*t40) - G00*t45 - t35*t62 - t35*t73);
+        const double t77 = 8.0*G22;
+        const double t78 = t32*t77;
+        const double t79 = 8.0*G12;
+        const double t80 = t23*t79;
+        const double t81 = 8.0*G02;
+        const double t82 = t23*t81;
+        const double t83 = f*t44;
+        const double t84 = 16.0*f;
+        const double t85 = G12*t84;
+        const double t86 = 4.0*G22;
+        const double t87 = f*t86;
+        const double t88 = G02*t84;
+        const double t89 = G12*t23;
+        const double t90 = G02*t23;
+        const double t91 = t50*t61;
+        const double along2 = f*(t46*(t78 + t24*t88 + t38*t85 + t53*t87 + t58*t89 + t60*t90) + t21*t28*(f*t78 + t24*t82 + t38*t80) - G02*t91 - t73*t90 - t81*t83);
+        const double t100 = G20*t23;
+        const double t101 = 8.0*t25;
+        const double t102 = 4.0*t8;
+        const double t103 = t25*t84;
+        const double t104 = t32*t47;
+        const double t106 = t105*t53;
+        const double t107 = t105*t66;
+        const double t108 = 8.0*t83;
+        const double t99 = G10*t42;
+        const double along6 = f*(t46*(G00*t104 + G00*t106 + G10*t107 + G20*t103 + t100*t102 + t47*t99) + t21*t28*(t100*t101 + t13*t99 + t32*t56) - G20*t108 - G20*t91 - t100*t73);
+        const double t111 = t32*t81;
+        const double t112 = t42*t79;
+        const double along8 = f*(t46*(t111 + t112 + t8*t86 + G02*f*t54 + G12*f*t94) + t21*t28*(f*t111 + f*t112 + t25*t77) - G22*t62 - t72*t86);
+        const double t126 = along8*c2_0;
+        const double t74 = G21*t32;
+        const double t75 = G11*t22;
+        const double t76 = G01*t22;
+        const double along1 = f*(t46*(G01*t59 + G11*t49 + t31*t54 + t47*t74 + t58*t75 + t60*t76) + t21*t28*(t13*t74 + t39*t75 + t40*t76) - G01*t45 - t62*t76 - t73*t76);
+        const double t109 = G11*t42;
+        const double along7 = f*(t46*(G01*t104 + G01*t106 + G11*t107 + G21*t103 + t102*t110 + t109*t47) + t21*t28*(t101*t110 + t109*t13 + G01*t13*t32) - G21*t108 - t110*t73 - t52*t61);
+        const double t92 = G20*t42;
+        const double t93 = 8.0*t26;
+        const double t95 = t26*t48;
+        const double t96 = 4.0*t20;
+        const double along3 = f*(t46*(G00*t49 + G10*t95 + t30*t94 + t34*t96 + t35*t58 + t47*t92) + t21*t28*(t13*t92 + t34*t93 + t35*t39) - G10*t45 - t34*t62 - t34*t73);
+        const double t98 = t42*t77;
+        const double along5 = f*(t46*(t98 + t26*t85 + t38*t88 + t58*t90 + t66*t87 + t89*t96) + t21*t28*(f*t98 + t26*t80 + t38*t82) - G12*t91 - t73*t89 - t79*t83);
+        const double t127 = along8*c2_1;
+        const double t97 = G21*t42;
+        const double along4 = f*(t46*(G01*t49 + G11*t95 + t31*t94 + t47*t97 + t58*t76 + t75*t96) + t21*t28*(t13*t97 + t39*t76 + t75*t93) - G11*t45 - t62*t75 - t73*t75);
+        difference[i] = t43*t46 - 1.0;
+        slope[i] = f*t114;
+        curvature[i] = f*(t114 + f*(2.0*t113*t71 + t44*(-t115 - t116 - t117) + t46*(t115*t63 + t116*t69 + t117*t70 + 2.0*t15*(t105*t11 + t105*t14 + t120*t9) + 2.0*t20*(t105*t18 + t105*t19 + t120*t16) + t54*(t29 + G01*t124 + t123*t51) + t58*(t105*t125 + t105*t36 + t120*t37) + t64*(G01*t122 + t121*t51) + t67*(G11*t122 + t121*t65) + t68*(t55 + t125*t47 + t36*t47) + 2.0*t8*(t120*t4 + t120*t6) + t94*(t41 + G11*t124 + t123*t65)) + t61*(-t11*t119 - t118*t16 - t118*t4 - t118*t6 - t118*t9 - t119*t14 - t119*t18 - t119*t19)));
+        J_F[i] = along0 + along2*c1_0 + along6*c2_0 + c1_0*t126;
+        J_F[n + i] = along1 + along2*c1_1 + along7*c2_0 + c1_1*t126;
+        J_F[2*n + i] = along2 + t126;
+        J_F[3*n + i] = along3 + along5*c1_0 + along6*c2_1 + c1_0*t127;
+        J_F[4*n + i] = along4 + along5*c1_1 + along7*c2_1 + c1_1*t127;
+        J_F[5*n + i] = along5 + t127;
+        J_F[6*n + i] = along6 + along8*c1_0;
+        J_F[7*n + i] = along7 + along8*c1_1;
+        J_F[8*n + i] = along8;
+        J_c[i] = F00*along2 + F10*along5 + along8*t2;
+        J_c[n + i] = F01*along2 + F11*along5 + along8*t3;
+        J_c[2*n + i] = F00*along6 + F01*along7 + along8*t0;
+        J_c[3*n + i] = F10*along6 + F11*along7 + along8*t1;
+    }
+}
+
 /* Formula: coefficients of P Omega P^T (upper triangle) by the upper triangle of the dual
    absolute quadric Omega.
    Inputs:  P (3, 4)

@@ -1291,6 +1291,12 @@ SIGNATURES = {
         (Argument("epipole", (3,), True), ),
         "e' with e'^T F = 0, of any length: the longest product of two columns of F.",
     ),
+    "shared_focal": Signature(
+        "self_calibration",
+        (Argument("F", (3, 3), True), Argument("c1", (2,), True), Argument("c2", (2,), True), Argument("f", (), True), ),
+        (Argument("difference", (1,), True), Argument("slope", (1,), True), Argument("curvature", (1,), True), Argument("J_F", (1, 9), True), Argument("J_c", (1, 4), True), ),
+        "((a - b) / (a + b))^2 of the squared singular values of E = K F K, zero where both cameras have the focal length f (P. Sturm, 2001), with its first and second derivatives by log f, and those of the first by vect(F) and both principal points.",
+    ),
     "dual_image_rows": Signature(
         "self_calibration",
         (Argument("P", (3, 4), True), ),
@@ -1308,6 +1314,12 @@ SIGNATURES = {
         (Argument("F", (3, 3), True), Argument("c1", (2,), True), Argument("c2", (2,), True), Argument("e1", (3,), True), Argument("e2", (3,), True), ),
         (Argument("squares", (2,), True), Argument("J_F", (2, 9), True), Argument("J_c", (2, 4), True), ),
         "squared focal lengths of two cameras from F and their principal points (Bougnoux, 1998), with Jacobians by vect(F) and by both points; e1, e2: the epipoles in coordinates about the principal points, as directions only.",
+    ),
+    "three_points": Signature(
+        "three_points",
+        (Argument("cosines", (3,), True), Argument("squares", (3,), True), ),
+        (Argument("quartic", (5,), True), Argument("above", (3,), True), Argument("below", (2,), True), ),
+        "coefficients, highest first, of the quartic in v = s3 / s1, and of the polynomials in v whose quotient is u = s2 / s1, for the distances s1, s2, s3 of three points; from the cosines of the angles between their rays, and the squares of their distances from one another.",
     ),
 }
 

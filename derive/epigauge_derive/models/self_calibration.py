@@ -52,8 +52,20 @@ def focal_squared(F: sp.Matrix, right: sp.Matrix) -> sp.Expr:
     return -above / (line * F * flat * F.T * p)[0]
 
 
+def difference(F: sp.Matrix, f: sp.Expr) -> sp.Expr:
+    """Return ((a - b) / (a + b))^2 of the squares a, b of the singular values of E = K F K.
+
+    They are equal where both cameras have the focal length f. With E of rank two, a + b and
+    a^2 + b^2 are traces of E E^T and of its square.
+    """
+    K = sp.diag(f, f, 1)
+    E = K * F * K
+    S = E * E.T
+    return 2 * (S * S).trace() / S.trace() ** 2 - 1
+
+
 def kernels() -> list[Kernel]:
-    """Return the linear rows, the intrinsics with their derivatives, and the two-view formula."""
+    """Return the linear rows, the intrinsics with their derivatives, and the two-view formulas."""
     camera = P.matrix()
     unknown = sp.Matrix(4, 4, lambda i, j: sp.Symbol(f"o{min(i, j)}{max(i, j)}", real=True))
     seen = upper(dual_image(camera, unknown).expand())
@@ -74,7 +86,29 @@ def kernels() -> list[Kernel]:
     by_G = jacobian(squares, list(G))
     slopes = sp.Matrix(2, 9, lambda i, j: sp.Symbol(f"slope{i}_{j}", real=True))
     named = dict(zip(slopes, by_G, strict=True))
+    # By log f: one curvature at all scales.
+    f = Input("f")
+    focal = f.entries()[0]
+    apart = difference(G, focal)
+    slope = focal * sp.diff(apart, focal)
+    along = sp.Matrix(1, 9, lambda i, j: sp.Symbol(f"along{j}", real=True))
+    by_slope = dict(zip(along, jacobian([slope], list(G)), strict=True))
     return [
+        Kernel(
+            "shared_focal",
+            "((a - b) / (a + b))^2 of the squared singular values of E = K F K, zero where both "
+            "cameras have the focal length f (P. Sturm, 2001), with its first and second "
+            "derivatives by log f, and those of the first by vect(F) and both principal points.",
+            (F, c1, c2, f),
+            (
+                Output.of("difference", [apart]),
+                Output.of("slope", [slope]),
+                Output.of("curvature", [focal * sp.diff(slope, focal)]),
+                Output.of("J_F", along * jacobian(list(centred), F.entries())),
+                Output.of("J_c", along * jacobian(list(centred), [*c1.entries(), *c2.entries()])),
+            ),
+            (Let(about), Let(by_slope)),
+        ),
         Kernel(
             "dual_image_rows",
             "coefficients of P Omega P^T (upper triangle) by the upper triangle of the dual "

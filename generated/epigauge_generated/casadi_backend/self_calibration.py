@@ -5,6 +5,207 @@ import casadi as ca
 
 
 @cache
+def shared_focal():
+    # Formula: ((a - b) / (a + b))^2 of the squared singular values of E = K F K, zero where both
+    # cameras have the focal length f (P. Sturm, 2001), with its first and second derivatives by
+    # log f, and those of the first by vect(F) and both principal points.
+    # Inputs:  F (3, 3), c1 (2,), c2 (2,), f ()
+    # Outputs: difference (1,), slope (1,), curvature (1,), J_F (1, 9), J_c (1, 4)
+    # Operations: 619, temporaries: 146.
+    F = ca.SX.sym("F", 3, 3)
+    F00 = F[0, 0]
+    F01 = F[0, 1]
+    F02 = F[0, 2]
+    F10 = F[1, 0]
+    F11 = F[1, 1]
+    F12 = F[1, 2]
+    F20 = F[2, 0]
+    F21 = F[2, 1]
+    F22 = F[2, 2]
+    c1 = ca.SX.sym("c1", 2, 1)
+    c1_0 = c1[0, 0]
+    c1_1 = c1[1, 0]
+    c2 = ca.SX.sym("c2", 2, 1)
+    c2_0 = c2[0, 0]
+    c2_1 = c2[1, 0]
+    f = ca.SX.sym("f", 1, 1)
+    G00 = F00
+    t11 = G00*G00
+    G01 = F01
+    t14 = G01*G01
+    t22 = f*f*f*f
+    t23 = f*f
+    t0 = F02 + F00*c1_0 + F01*c1_1
+    G02 = t0
+    t9 = G02*G02
+    t24 = t11*t22 + t14*t22 + t23*t9
+    t2 = F20 + F00*c2_0 + F10*c2_1
+    t3 = F21 + F01*c2_0 + F11*c2_1
+    G22 = F22 + F02*c2_0 + F12*c2_1 + c1_0*t2 + c1_1*t3
+    G20 = t2
+    t4 = G20*G20
+    G21 = t3
+    t6 = G21*G21
+    t25 = G22*G22 + t23*t4 + t23*t6
+    t1 = F12 + F10*c1_0 + F11*c1_1
+    G12 = t1
+    t16 = G12*G12
+    G10 = F10
+    t18 = G10*G10
+    G11 = F11
+    t19 = G11*G11
+    t26 = t16*t23 + t18*t22 + t19*t22
+    t29 = G02*G22
+    t12 = f*f*f
+    t30 = G20*t12
+    t31 = G21*t12
+    t32 = G00*t30 + G01*t31 + f*t29
+    t35 = G00*t22
+    t36 = G01*G11
+    t37 = G02*G12
+    t38 = G10*t35 + t22*t36 + t23*t37
+    t41 = G12*G22
+    t42 = G10*t30 + G11*t31 + f*t41
+    t43 = 2.0*t24*t24 + 2.0*t25*t25 + 2.0*t26*t26 + 4.0*t32*t32 + 4.0*t38*t38 + 4.0*t42*t42
+    t27 = t24 + t25 + t26
+    t46 = 1.0/(t27*t27)
+    t10 = 4.0*t9
+    t13 = 8.0*t12
+    t15 = f*t10 + t11*t13 + t13*t14
+    t17 = 4.0*t16
+    t20 = f*t17 + t13*t18 + t13*t19
+    t5 = 4.0*t4
+    t7 = 4.0*t6
+    t8 = f*t5 + f*t7
+    t21 = -t15 - t20 - t8
+    t28 = 1.0/(t27*t27*t27)
+    t113 = t21*t28
+    t50 = 6.0*t23
+    t51 = G00*G20
+    t52 = G21*t50
+    t53 = 2.0*t29 + G01*t52 + t50*t51
+    t55 = 4.0*t37
+    t56 = G00*t13
+    t57 = G10*t56 + f*t55 + t13*t36
+    t63 = 2.0*t25
+    t64 = 4.0*t32
+    t65 = G10*G20
+    t66 = 2.0*t41 + G11*t52 + t50*t65
+    t67 = 4.0*t42
+    t68 = 4.0*t38
+    t69 = 2.0*t24
+    t70 = 2.0*t26
+    t71 = t15*t69 + t20*t70 + t53*t64 + t57*t68 + t63*t8 + t66*t67
+    t114 = t113*t43 + t46*t71
+    t105 = 4.0*t12
+    t115 = t5 + t7
+    t47 = 24.0*t23
+    t116 = t10 + t11*t47 + t14*t47
+    t117 = t17 + t18*t47 + t19*t47
+    t118 = 6.0*f
+    t119 = 12.0*t12
+    t120 = 2.0*f
+    t121 = 12.0*f
+    t122 = G21*t121
+    t123 = 3.0*t23
+    t110 = G21*t23
+    t124 = 3.0*t110
+    t125 = G00*G10
+    t44 = t28*t43
+    t54 = 4.0*t53
+    t58 = 4.0*t57
+    t61 = t21*t43/(t27*t27*t27*t27)
+    t94 = 4.0*t66
+    t33 = G20*t32
+    t34 = G10*t22
+    t39 = 8.0*t38
+    t40 = 8.0*t24
+    t45 = 16.0*t12*t44
+    t48 = 32.0*t12
+    t49 = t38*t48
+    t59 = t24*t48
+    t60 = 4.0*t15
+    t62 = 6.0*t61
+    t72 = t28*t71
+    t73 = 4.0*t72
+    along0 = f*(t46*(G00*t59 + G10*t49 + t30*t54 + t33*t47 + t34*t58 + t35*t60) + t21*t28*(t13*t33 + t34*t39 + t35*t40) - G00*t45 - t35*t62 - t35*t73)
+    t77 = 8.0*G22
+    t78 = t32*t77
+    t79 = 8.0*G12
+    t80 = t23*t79
+    t81 = 8.0*G02
+    t82 = t23*t81
+    t83 = f*t44
+    t84 = 16.0*f
+    t85 = G12*t84
+    t86 = 4.0*G22
+    t87 = f*t86
+    t88 = G02*t84
+    t89 = G12*t23
+    t90 = G02*t23
+    t91 = t50*t61
+    along2 = f*(t46*(t78 + t24*t88 + t38*t85 + t53*t87 + t58*t89 + t60*t90) + t21*t28*(f*t78 + t24*t82 + t38*t80) - G02*t91 - t73*t90 - t81*t83)
+    t100 = G20*t23
+    t101 = 8.0*t25
+    t102 = 4.0*t8
+    t103 = t25*t84
+    t104 = t32*t47
+    t106 = t105*t53
+    t107 = t105*t66
+    t108 = 8.0*t83
+    t99 = G10*t42
+    along6 = f*(t46*(G00*t104 + G00*t106 + G10*t107 + G20*t103 + t100*t102 + t47*t99) + t21*t28*(t100*t101 + t13*t99 + t32*t56) - G20*t108 - G20*t91 - t100*t73)
+    t111 = t32*t81
+    t112 = t42*t79
+    along8 = f*(t46*(t111 + t112 + t8*t86 + G02*f*t54 + G12*f*t94) + t21*t28*(f*t111 + f*t112 + t25*t77) - G22*t62 - t72*t86)
+    t126 = along8*c2_0
+    t74 = G21*t32
+    t75 = G11*t22
+    t76 = G01*t22
+    along1 = f*(t46*(G01*t59 + G11*t49 + t31*t54 + t47*t74 + t58*t75 + t60*t76) + t21*t28*(t13*t74 + t39*t75 + t40*t76) - G01*t45 - t62*t76 - t73*t76)
+    t109 = G11*t42
+    along7 = f*(t46*(G01*t104 + G01*t106 + G11*t107 + G21*t103 + t102*t110 + t109*t47) + t21*t28*(t101*t110 + t109*t13 + G01*t13*t32) - G21*t108 - t110*t73 - t52*t61)
+    t92 = G20*t42
+    t93 = 8.0*t26
+    t95 = t26*t48
+    t96 = 4.0*t20
+    along3 = f*(t46*(G00*t49 + G10*t95 + t30*t94 + t34*t96 + t35*t58 + t47*t92) + t21*t28*(t13*t92 + t34*t93 + t35*t39) - G10*t45 - t34*t62 - t34*t73)
+    t98 = t42*t77
+    along5 = f*(t46*(t98 + t26*t85 + t38*t88 + t58*t90 + t66*t87 + t89*t96) + t21*t28*(f*t98 + t26*t80 + t38*t82) - G12*t91 - t73*t89 - t79*t83)
+    t127 = along8*c2_1
+    t97 = G21*t42
+    along4 = f*(t46*(G01*t49 + G11*t95 + t31*t94 + t47*t97 + t58*t76 + t75*t96) + t21*t28*(t13*t97 + t39*t76 + t75*t93) - G11*t45 - t62*t75 - t73*t75)
+    difference = ca.SX(1, 1)
+    difference[0, 0] = t43*t46 - 1.0
+    slope = ca.SX(1, 1)
+    slope[0, 0] = f*t114
+    curvature = ca.SX(1, 1)
+    curvature[0, 0] = f*(t114 + f*(2.0*t113*t71 + t44*(-t115 - t116 - t117) + t46*(t115*t63 + t116*t69 + t117*t70 + 2.0*t15*(t105*t11 + t105*t14 + t120*t9) + 2.0*t20*(t105*t18 + t105*t19 + t120*t16) + t54*(t29 + G01*t124 + t123*t51) + t58*(t105*t125 + t105*t36 + t120*t37) + t64*(G01*t122 + t121*t51) + t67*(G11*t122 + t121*t65) + t68*(t55 + t125*t47 + t36*t47) + 2.0*t8*(t120*t4 + t120*t6) + t94*(t41 + G11*t124 + t123*t65)) + t61*(-t11*t119 - t118*t16 - t118*t4 - t118*t6 - t118*t9 - t119*t14 - t119*t18 - t119*t19)))
+    J_F = ca.SX(1, 9)
+    J_F[0, 0] = along0 + along2*c1_0 + along6*c2_0 + c1_0*t126
+    J_F[0, 1] = along1 + along2*c1_1 + along7*c2_0 + c1_1*t126
+    J_F[0, 2] = along2 + t126
+    J_F[0, 3] = along3 + along5*c1_0 + along6*c2_1 + c1_0*t127
+    J_F[0, 4] = along4 + along5*c1_1 + along7*c2_1 + c1_1*t127
+    J_F[0, 5] = along5 + t127
+    J_F[0, 6] = along6 + along8*c1_0
+    J_F[0, 7] = along7 + along8*c1_1
+    J_F[0, 8] = along8
+    J_c = ca.SX(1, 4)
+    J_c[0, 0] = F00*along2 + F10*along5 + along8*t2
+    J_c[0, 1] = F01*along2 + F11*along5 + along8*t3
+    J_c[0, 2] = F00*along6 + F01*along7 + along8*t0
+    J_c[0, 3] = F10*along6 + F11*along7 + along8*t1
+    return ca.Function(
+        "shared_focal",
+        [F, c1, c2, f],
+        [difference, slope, curvature, J_F, J_c],
+        ["F", "c1", "c2", "f"],
+        ["difference", "slope", "curvature", "J_F", "J_c"],
+    )
+
+
+@cache
 def dual_image_rows():
     # Formula: coefficients of P Omega P^T (upper triangle) by the upper triangle of the dual
     # absolute quadric Omega.

@@ -13,7 +13,7 @@ from epigauge.metric.quadric import Basis, Views
 from epigauge.multi_view.plausible import depth_signs
 from epigauge.multi_view.tracks import Tracks
 
-__all__ = ["Images", "metric_scene", "with_all_points"]
+__all__ = ["Images", "cameras_of", "metric_scene", "with_all_points"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -98,7 +98,7 @@ def metric_scene(
     U, sizes, Vt = np.linalg.svd(M[:, :, :3])
     R = U @ Vt
     t = M[:, :, 3] / sizes.mean(axis=1)[:, None]
-    cameras = _cameras(camera, focal * images.unit, images)
+    cameras = cameras_of(camera, focal * images.unit, images)
     with np.errstate(divide="ignore", invalid="ignore"):
         points = X[:, :3] / X[:, 3:]
     return _framed(R, t, points, cameras, tracks), ahead
@@ -137,7 +137,7 @@ def with_all_points(
     return _framed(found.R, found.t, points, found.cameras, tracks)
 
 
-def _cameras(camera: str, focal_px: Array, images: Images) -> Cameras:
+def cameras_of(camera: str, focal_px: Array, images: Images) -> Cameras:
     """Return cameras of a model with focal lengths and centres, without distortion."""
     model = camera_model(camera)
     params = np.zeros((images.group.max() + 1, len(model.params)))

@@ -12,6 +12,7 @@ from epigauge import kernels
 from epigauge.bundle.prior_kinds import IntrinsicPrior
 from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
+from epigauge.metric.growth import grown
 from epigauge.metric.quadric import Basis, Views, metric_bases
 from epigauge.metric.samples import Sample
 from epigauge.metric.scene import Images, metric_scene
@@ -38,6 +39,10 @@ _CENTRE_KNOWN, _BEND_KNOWN = 0.02, 0.1
 
 #: Metric cameras whose median distance is so many times that of projective ones do not fit.
 _MISFIT = 2.0
+
+#: Focal lengths that a scene grows from where no projective reconstruction leads to a good one, in
+#: units of width plus height.
+_GUESSES = (0.7, 0.4, 1.2)
 
 #: A projective reconstruction is doubted, and sought robustly, where its median distance exceeds
 #: this share of width plus height, or where less of it is in front of some metric cameras.
@@ -141,7 +146,8 @@ class Search:
     def run(self, given: Reconstruction | None) -> Fit | None:
         """Return the best metric scene, from a projective reconstruction or without.
 
-        Without, a plain start is tried first, and a robust one where that leads nowhere good.
+        Without, a plain start is tried first, a robust one where that leads nowhere good, and then
+        calibrated cameras in turn, from guesses of the focal length.
         """
         best: Fit | None = None
         for robust in (False, True):
@@ -157,8 +163,43 @@ class Search:
             if fit is not None and (best is None or fit.typical < best.typical):
                 best = fit
             if given is not None or (best is not None and not self._doubted(best)):
-                break
+                return best
+        return self._better(best)
+
+    def _better(self, best: Fit | None) -> Fit | None:
+        """Return the best of a doubted scene and those that grow from guessed focal lengths."""
+        tracks, unit = self.sample.tracks, self.images.unit
+        for share in _GUESSES:
+            try:
+                scene = grown(tracks, self.images, self.camera, share * unit, self.options)
+                fit = None if scene is None else self._of_grown(scene, share)
+            except (ArgumentError, np.linalg.LinAlgError):
+                continue
+            if fit is not None and (best is None or fit.typical < best.typical):
+                best = fit
+                if not self._doubted(best):
+                    break
         return best
+
+    def _of_grown(self, scene: MetricReconstruction, share: float) -> Fit:
+        """Return a scene that grew, adjusted, beside the projective one next to it."""
+        tracks, options = self.sample.tracks, self.options
+        adjusted = self._adjusted(scene, self._first())
+        projective = bundle_adjust(
+            tracks, adjusted.to_projective(), loss="cauchy", ftol=1e-4, **options
+        )
+        ahead = float(np.mean(adjusted.depths(tracks)[tracks.weights > 0.0] > 0.0))
+        cost = self._cost(adjusted, projective.loss_scale_px)
+        guess = Basis(np.eye(4), share, float("nan"), cost)
+        best, refined = self._freed(adjusted)
+        return Fit(
+            best,
+            refined,
+            (self._candidate(guess, ahead, adjusted, cost),),
+            median(np.linalg.norm(tracks.xy - best.project(tracks), axis=1)),
+            median(np.linalg.norm(projective.fun, axis=1)),
+            ahead,
+        )
 
     def misfit(self, fit: Fit, typical: float) -> bool:
         """Tell whether projective cameras explain the sample much better than metric ones.
