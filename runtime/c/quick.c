@@ -271,7 +271,8 @@ static double on_plane(scratch_t *s, const double *motion, const double *F, doub
             memcpy(best, v, sizeof best);
         }
     }
-    refit(&p, options->reach * unit, best);
+    for (ptrdiff_t k = 0; k < options->grows; ++k)
+        refit(&p, options->reach * unit, best);
     refit(&p, options->far * unit, best);
     *places = places_off(s, &p, best, options->far * unit, options->beside);
     return count_on(&p, best, options->far * unit) / (double)size;

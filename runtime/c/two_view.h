@@ -95,6 +95,7 @@ typedef struct {
     double tail;             /* robust deviations beyond which a match is in the tail */
     double reach, far;       /* standard deviations off a plane through three matches, or more */
     ptrdiff_t samples, pool; /* threes of matches, and how many they are judged by */
+    ptrdiff_t grows;         /* fits to those that are on the best plane, as it grows */
     ptrdiff_t pairs, rank;   /* wrong pairs, and how many must be near */
     double beside;           /* what is in one place */
     ptrdiff_t searched;      /* whether F itself chose these among raw matches */

@@ -5,7 +5,7 @@ from __future__ import annotations
 import epigauge as eg
 import numpy as np
 import pytest
-from pair_scenes import PINHOLE, SIZE, plane, write
+from pair_scenes import PINHOLE, SIZE, pixels, plane, write
 
 needs_a_front_end = pytest.mark.skipif(
     not any(__import__("importlib.util").util.find_spec(name) for name in ("poselib", "cv2")),
@@ -266,3 +266,18 @@ class TestCommands:
         for seed in range(4):
             x1, x2 = np.random.default_rng(seed).uniform([0, 0], SIZE, (2, 20, 2))
             assert "no common geometry" in eg.estimate_fundamental(x1, x2).flags
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+def test_a_plane_that_is_a_strip_of_the_image_is_told_among_wrong_matches(noise) -> None:
+    """Three points of a strip reach little of it: an F of the plane and two wrong ones hid it."""
+    for seed in range(4):
+        rng = np.random.default_rng([17, 300, seed])
+        place, along = rng.uniform([-0.5, -0.4], [0.5, 0.4], (2, 2))
+        ray = np.append(place, 1.0) + rng.random((210, 1)) * np.append(along - place, 0.0)
+        X = 5.0 * (ray + np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, rng.uniform(0.2, 0.8)], 210))
+        x1, x2 = (pixels(Y) for Y in (X, X + np.array([0.5, 0.2, 0.3])))
+        x1, x2 = (x + noise * rng.standard_normal(x.shape) for x in (x1, x2))
+        wrong = rng.uniform([0.0, 0.0], SIZE, (2, 90, 2))
+        result = eg.estimate_fundamental(np.vstack([x1, wrong[0]]), np.vstack([x2, wrong[1]]))
+        assert not result.success

@@ -20,6 +20,8 @@ from epigauge.two_view.homography import fit_homography, robust_homography
 __all__ = [
     "BESIDE",
     "FAR_OFF",
+    "GROWS",
+    "HALF_ON",
     "HIDDEN",
     "MOST_ON",
     "OFF_PLANE",
@@ -52,10 +54,13 @@ FAR_OFF = 8.0
 
 #: A plane that most are on is found by threes of the matches, judged by at most so many of them,
 #: within this distance in standard deviations: farther than `FAR_OFF`, since three points fix a
-#: plane less well than all do. Where it then has less than this share, no plane has most.
+#: plane less well than all do. So many times it is fitted to those that are: three of a strip reach
+#: little of it at first. Where it then has less than this share, no plane has most; of
+#: raw matches, where an F of few others may hide it, less than half.
 SAMPLES, POOL = 24, 200
-REACH = 12.0
+REACH, GROWS = 12.0, 4
 MOST_ON = 0.7
+HALF_ON = 0.5
 
 #: The largest RMS off a plane that is its relief, as a share of the range of the coordinates (10 px
 #: in an image of 1000), far matches counting as if they were eight deviations off. And the noise
@@ -133,7 +138,7 @@ def is_plain_relief(found: Evidence) -> bool:
     rows, on = on_a_plane(found)
     q = np.concatenate([found.q1, found.q2])[:, rows[~on]]
     places = len(np.unique(np.round(q / (BESIDE * RANGE)), axis=1).T)
-    if places < PLENTY or np.mean(on) >= MOST_ON:
+    if places < PLENTY or np.mean(on) >= HALF_ON:
         return False
     limit, share = found.limit, len(rows) / found.q1.shape[1]
     chance = chance_agreement(found.table, found.F, found.all1, found.all2, limit)
@@ -143,7 +148,7 @@ def is_plain_relief(found: Evidence) -> bool:
 def on_a_plane(found: Evidence) -> tuple[NDArray[np.intp], Mask]:
     """Return some inliers, and which of them are on the plane of `share_on_a_plane`."""
     U = np.linalg.svd(found.F)[0]
-    n = found.q1.shape[1]
+    n, noise = found.q1.shape[1], max(found.noise, ROUNDING)
     step = -(-n // POOL)
     with np.errstate(all="ignore"):  # a match on an epipole says nothing of a plane
         kappa, gain = found.table.plane_parallax(found.F, U[:, 2].copy(), found.q1, found.q2)
@@ -155,16 +160,16 @@ def on_a_plane(found: Evidence) -> tuple[NDArray[np.intp], Mask]:
         area = ab[0] * ac[1] - ab[1] * ac[0]
         v = np.array([bk * ac[1] - ck * ab[1], ab[0] * ck - ac[0] * bk]) / area
         v = np.vstack([v, kappa[a] - v[0] * q[0, a] - v[1] * q[1, a]])
-        counts = np.sum(_on(v, q, kappa, gain, REACH * found.noise), axis=1)
+        counts = np.sum(_on(v, q, kappa, gain, REACH * noise), axis=1)
         counts[~np.isfinite(v).all(axis=0)] = 0
         best = v[:, [np.argmax(counts)]]
-        for deviations in (REACH, FAR_OFF):
-            on = _on(best, q, kappa, gain, deviations * found.noise)[0] & np.isfinite(gain)
+        for deviations in (REACH,) * GROWS + (FAR_OFF,):
+            on = _on(best, q, kappa, gain, deviations * noise)[0] & np.isfinite(gain)
             rows = (q * gain)[:, on]
             A, b = rows @ rows.T, rows @ (gain * kappa)[on]
             if np.linalg.cond(A) < 1e12:
                 best = np.linalg.solve(A, b)[:, None]
-        on = _on(best, q, kappa, gain, FAR_OFF * found.noise)[0]
+        on = _on(best, q, kappa, gain, FAR_OFF * noise)[0]
     return np.arange(0, n, step), on
 
 

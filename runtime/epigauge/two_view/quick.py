@@ -29,6 +29,8 @@ from epigauge.two_view.evidence import WITHIN, of_median_one
 from epigauge.two_view.planes import (
     BESIDE,
     FAR_OFF,
+    GROWS,
+    HALF_ON,
     HIDDEN,
     MOST_ON,
     PLAINLY,
@@ -106,13 +108,25 @@ class Facts(NamedTuple):
 class _Options(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_double) for name in ("within", "wide", "hidden", "tail", "reach", "far")),
-        *((name, ctypes.c_ssize_t) for name in ("samples", "pool", "pairs", "rank")),
+        *((name, ctypes.c_ssize_t) for name in ("samples", "pool", "grows", "pairs", "rank")),
         ("beside", ctypes.c_double),
         ("searched", ctypes.c_ssize_t),
     )
 
 
-_NUMBERS = (WITHIN, WIDE * RANGE, HIDDEN * RANGE, TAIL, REACH, FAR_OFF, SAMPLES, POOL, PAIRS, RANK)
+_NUMBERS = (
+    WITHIN,
+    WIDE * RANGE,
+    HIDDEN * RANGE,
+    TAIL,
+    REACH,
+    FAR_OFF,
+    SAMPLES,
+    POOL,
+    GROWS,
+    PAIRS,
+    RANK,
+)
 _OPTIONS, _SEARCHED = (_Options(*_NUMBERS, BESIDE * RANGE, searched) for searched in (0, 1))
 
 
@@ -211,7 +225,7 @@ def verdict_of_raw(
     if may_be_lines(y1, y2, np.array([0, len(y1)]), np.array([scale * _noise(own)]))[0]:
         return None, False
     plain = _plain_flags(own, scale)
-    if plain is None or own.on_plane >= MOST_ON or own.places < PLENTY:
+    if plain is None or own.on_plane >= HALF_ON or own.places < PLENTY:
         return None, False
     m, n = int(np.count_nonzero(counts)), int(own.number)
     wrong, copies = chance(), int(own.repeated)
