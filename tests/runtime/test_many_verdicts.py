@@ -133,6 +133,28 @@ def test_scenes_without_parallax_end_flagged(kind: str, n: int, seed: int) -> No
         assert "pure rotation" in found.flags
 
 
+def approaching(n: int) -> Array:
+    """Return cameras that come nearer, and turn to keep the scene in sight."""
+    cameras = []
+    for k in range(n):
+        c, s = np.cos(0.5 * k / n), np.sin(0.5 * k / n)
+        R = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+        cameras.append(K @ np.c_[R, [0.1 * k, -0.1 * k, 9.0 - 6.5 * k / (n - 1)]])
+    return np.array(cameras)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_flat_scene_is_told_at_all_scales(seed: int) -> None:
+    """From 9 m to 2.5 m away the noise of far images is magnified, and is no relief."""
+    X = cloud(60, seed)
+    found = eg.bundle_adjust(all_seen(approaching(5), X, seed))
+    assert not {"planar scene", "nearly planar"} & set(found.flags)
+    X[:, 2] = 0.0
+    found = eg.bundle_adjust(all_seen(approaching(5), X, seed))
+    assert not found.success
+    assert "planar scene" in found.flags
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("n", [3, 5, 15])
 def test_general_scenes_raise_nothing(n: int, seed: int) -> None:

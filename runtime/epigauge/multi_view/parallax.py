@@ -67,7 +67,8 @@ def parallax_flags(seen: Seen, noise_px: float) -> tuple[str, ...]:
     for pairs in _pairs(seen):
         x1, x2, first = _matches(seen, pairs)
         fits = fit_homographies(x1, x2, first)
-        share = np.add.reduceat(fits.distances > limit, first[:-1]) / np.diff(first)
+        off = fits.distances > limit * fits.deviations
+        share = np.add.reduceat(off, first[:-1]) / np.diff(first)
         if (share > _FEW).any():
             return ()
         shares.append(share)
@@ -93,7 +94,7 @@ def _plainly_off(seen: Seen, limit: float) -> bool:
     fit = _Fit(x1, x2, first)
     for _ in range(_FIRST_ROUNDS):
         fit.again()
-    off = fit.scale * fit.distances > limit
+    off = fit.scale * fit.distances > limit * fit.deviations()
     return bool(np.count_nonzero(off) > _MOSTLY * len(off))
 
 
@@ -160,6 +161,8 @@ class Homographies:
         In coordinates centred at `centre`, in units of `scale` pixels, of determinant 1.
     distances : ndarray, shape (m,)
         Transfer error of each match, in pixels.
+    deviations : ndarray, shape (m,)
+        Its deviation over that where both images have one scale: noise is magnified on its way.
     covariance : ndarray, shape (k, 9, 9)
         Of the entries of H, for a noise of one unit.
     scale : float
@@ -168,6 +171,7 @@ class Homographies:
 
     H: Array
     distances: Array
+    deviations: Array
     covariance: Array
     scale: float
 
@@ -212,7 +216,8 @@ def fit_homographies(x1: Array, x2: Array, first: Indices, rounds: int = _ROUNDS
     covariance = inverse @ np.swapaxes(vectors[:, :, 1:], 1, 2)
     factor = fit.typical_depth / size**2 * _means(fit.weights**2, first)
     covariance *= factor[:, None, None]
-    return Homographies(H / size[:, None, None], scale * fit.distances, covariance, scale)
+    H /= size[:, None, None]
+    return Homographies(H, scale * fit.distances, fit.deviations(), covariance, scale)
 
 
 class _Fit:
@@ -266,6 +271,16 @@ class _Fit:
         self.typical_depth = _means(depth, first)
         relative = np.maximum(depth / self.typical_depth[group], 1e-6)
         self.weights = 1.0 / (1.0 + (distances / typical) ** 2) / relative
+
+    def deviations(self) -> Array:
+        """Return the deviation of each transfer error over that where both scales are equal."""
+        H = self.H[self._group]
+        h = np.einsum("mij,mj->mi", H, self._a)
+        with np.errstate(all="ignore"):
+            to = h[:, :2] / h[:, 2:]
+            J = (H[:, :2, :2] - to[:, :, None] * H[:, 2, None, :2]) / h[:, 2, None, None]
+            found = np.sqrt(0.5 + 0.25 * np.einsum("mij,mij->m", J, J))
+        return np.where(np.isfinite(found), found, 1.0)
 
 
 def _medians(values: Array, group: Indices, first: Indices) -> Array:
