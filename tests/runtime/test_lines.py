@@ -328,3 +328,28 @@ def test_a_scene_of_no_line_is_one_without_lines(tmp_path, scene):
     empty = dataclasses.replace(scene.true, lines=np.zeros((0, 6)))
     assert empty.lines is None
     eg.save_scene(tmp_path / "folder", scene.tracks, empty)
+
+
+def test_priors_and_gauges_go_with_lines(scene, adjusted):
+    lines, true = scene.line_tracks, scene.true
+    options = {"lines": lines, "refine": "pose", "ftol": 1e-12}
+    priors = [eg.PositionPrior(i, true.centres[i], 0.05) for i in range(8)]
+    known = eg.bundle_adjust(scene.tracks, true, priors=priors, **options)
+    assert known.success
+    assert known.rank == adjusted.rank + 7
+    assert np.abs(known.reconstruction.centres - true.centres).max() < 0.1
+    again = eg.triangulate_lines(lines, known.reconstruction)
+    assert off(again, known.reconstruction.lines).max() < 1e-4
+    for how in (
+        {"method": "levenberg", "gauge": eg.gauge.normalized()},
+        {"method": "hartley"},
+        {"method": "bartoli"},
+        {"method": "mclauchlan"},
+    ):
+        found = eg.bundle_adjust(scene.tracks, true, **options, **how)
+        np.testing.assert_allclose(found.cost, adjusted.cost, rtol=1e-5)
+        assert found.rank == adjusted.rank
+        # Lines are in the frame that the gauge has moved cameras and points to.
+        again = eg.triangulate_lines(lines, found.reconstruction)
+        size = np.linalg.norm(again, axis=1).max()
+        assert np.median(off(again, found.reconstruction.lines)) < 1e-3 * size

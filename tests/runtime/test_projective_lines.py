@@ -201,6 +201,79 @@ def test_text_tells_of_lines(start):
     assert "lines" not in str(dataclasses.replace(start, lines=None))
 
 
+def jacobian(made):
+    """Return the derivatives of all residuals of points, then of lines, by all unknowns."""
+    of_points, (of_lines,), at = made.problem.linearizer, made.problem.kinds, made.start
+    n, m, k = len(at.cameras), len(at.points), len(at.others[0])
+    rows = []
+    for own, features, first in (
+        (of_points, at.points, 12 * n),
+        (of_lines, at.others[0], 12 * n + 4 * m),
+    ):
+        _, A, B = own.observe(at.cameras, features)
+        J = np.zeros((A.shape[2], 2, 12 * n + 4 * m + 4 * k))
+        for row, i, j, a, b in zip(J, own.graph.view, own.graph.point, A.T, B.T, strict=True):
+            row[:, 12 * i : 12 * i + 12] = a.T
+            row[:, first + 4 * j : first + 4 * j + 4] = b.T
+        rows.append(J)
+    return np.concatenate(rows)
+
+
+def test_covariances_of_images_are_those_of_a_dense_inverse(scene, adjusted):
+    tracks, lines, found = scene.tracks, scene.line_tracks, adjusted.reconstruction
+    J = jacobian(line_problem(tracks, found, lines, table("numpy")))
+    whole = J.reshape(-1, J.shape[2])
+    values = np.linalg.svd(whole, compute_uv=False)
+    assert np.count_nonzero(values > 1e-10 * values[0]) == adjusted.rank
+    hat = whole @ np.linalg.pinv(whole, rcond=1e-10)
+    wanted = np.stack([hat[k : k + 2, k : k + 2] for k in range(0, len(hat), 2)])
+    for gauge in (None, eg.gauge.normalized(), eg.gauge.two_cameras()):
+        cov = eg.covariance(tracks, found, gauge, noise_px=2.0, lines=lines)
+        np.testing.assert_allclose(cov.projections, 4.0 * wanted[: len(tracks)], atol=1e-9)
+        np.testing.assert_allclose(cov.line_projections, 4.0 * wanted[len(tracks) :], atol=1e-9)
+        assert len(cov.reconstruction.lines) == lines.n_lines
+    some = cov.of_projections(tracks.view[:3], tracks.point[:3])
+    np.testing.assert_allclose(some, cov.projections[:3], atol=1e-9)
+    redundancy = 2 * len(tracks) + 2 * len(lines) - adjusted.rank
+    told = eg.covariance(tracks, found, lines=lines).noise_px
+    assert told == pytest.approx(np.sqrt(2.0 * adjusted.cost / redundancy), rel=1e-6)
+
+
+def test_errors_fall_as_the_covariance_says_and_lines_improve_the_images():
+    squares, errors, told = [], [], []
+    for seed in range(4):
+        scene = eg.line_scene(n_views=8, n_points=20, n_lines=60, seed=seed)
+        true, tracks = scene.true.to_projective(), scene.tracks
+        exact, both = true.project(tracks), []
+        for lines in (None, scene.line_tracks):
+            found = eg.bundle_adjust(tracks, true, lines=lines).reconstruction
+            S = eg.covariance(tracks, found, noise_px=1.0, lines=lines).projections
+            e = found.project(tracks) - exact
+            both.append(np.mean(np.einsum("ni,nij,nj->n", e, np.linalg.inv(S), e)) / 2.0)
+            errors.append(np.mean(e**2))
+            told.append(np.mean(np.einsum("nii->n", S)) / 2.0)
+        squares.append(both)
+    # 160 images of points a run share some 130 unknowns: four runs are good for a tenth.
+    np.testing.assert_allclose(np.mean(squares, axis=0), 1.0, atol=0.25)
+    for one in (errors, told):
+        alone, mixed = np.mean(np.reshape(one, (4, 2)), axis=0)
+        assert mixed < 0.9 * alone
+
+
+def test_covariances_without_the_segments_of_lines_are_refused(scene, adjusted):
+    found = adjusted.reconstruction
+    with pytest.raises(eg.ArgumentError, match="has 20 lines"):
+        eg.covariance(scene.tracks, found)
+    alone = dataclasses.replace(found, lines=None)
+    with pytest.raises(eg.ArgumentError, match="has no lines"):
+        eg.covariance(scene.tracks, alone, lines=scene.line_tracks)
+    with pytest.raises(eg.ArgumentError, match="'huber' with lines"):
+        eg.covariance(scene.tracks, found, lines=scene.line_tracks, loss="huber")
+    fewer = dataclasses.replace(found, lines=found.lines[:4])
+    with pytest.raises(eg.ArgumentError, match="has 4 lines"):
+        eg.covariance(scene.tracks, fewer, lines=scene.line_tracks)
+
+
 def test_files_keep_the_lines(tmp_path, scene, start):
     for write, read in (
         (

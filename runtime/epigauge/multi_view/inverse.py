@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.bundle.linearizer import Normal
+from epigauge.bundle.lines import LineLinearizer
 from epigauge.bundle.native_linearizer import NativeLinearizer
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer, inverse_roots
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.solve import BundleSystem
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.datum import freedom
+from epigauge.uncertainty.features import FeatureLinearizer
 from epigauge.uncertainty.inverse import Inverse as Selected
 from epigauge.uncertainty.inverse import Motions
 
@@ -39,6 +41,8 @@ class Inverse:
         The observations.
     state : tuple of ndarray, shape (n, 12), (m, 4)
         Where N was made, in conditioned coordinates.
+    lines : ndarray, shape (L, 6)
+        Lines there; they are features of the inverse behind the points.
     scale : float
         Pixels a unit of the image.
     """
@@ -47,11 +51,23 @@ class Inverse:
     linearizer: NumpyLinearizer
     state: tuple[Array, Array]
     scale: float
+    lines: Array
 
     @staticmethod
-    def of(linearizer: NumpyLinearizer, state: tuple[Array, Array], scale: float) -> Inverse:
-        """Invert the normal equations at a state."""
-        normal = _normal(linearizer, state)
+    def of(
+        linearizer: NumpyLinearizer,
+        state: tuple[Array, Array],
+        scale: float,
+        segments: LineLinearizer | None = None,
+        lines: Array | None = None,
+    ) -> Inverse:
+        """Invert the normal equations at a state, with those of lines where there are any."""
+        reference, features = linearizer, state[1]
+        if segments is not None:
+            assert lines is not None
+            reference = FeatureLinearizer.of(linearizer, segments)
+            features = FeatureLinearizer.rows(state[1], lines)
+        normal = _normal(reference, (state[0], features))
         assert normal.depth_blocks is not None
         damping = normal.U + normal.depth_blocks[0], normal.V + normal.depth_blocks[1]
         try:
@@ -64,16 +80,21 @@ class Inverse:
             ) from None
         # Unit scales, and orthonormal changes of basis, in parameters in which W is one.
         P = state[0].reshape(-1, 3, 4)
-        p, q, G = freedom(linearizer.kernels, P, state[1], (cameras, points))
+        m = len(state[1])
+        p, q, G = freedom(linearizer.kernels, P, state[1], (cameras, points[:m]))
         p = np.einsum("nji,nj->ni", cameras, p)
-        q = np.einsum("nji,nj->ni", points, q)
+        # Lines have no scale.
+        beside = (0, len(features) - m), (0, 0)
+        q = np.pad(np.einsum("nji,nj->ni", points[:m], q), beside)
         grounded = replace(
             normal,
             U=normal.U + p[:, :, None] * p[:, None, :],
             V=normal.V + q[:, :, None] * q[:, None, :],
         )
         n, a = p.shape
-        unit, y = G[: n * a].reshape(n, a, -1), G[n * a :].reshape(len(q), q.shape[1], -1)
+        # Their own motions play no part: what holds the gauge are cameras.
+        unit, y = G[: n * a].reshape(n, a, -1), G[n * a :].reshape(m, q.shape[1], -1)
+        y = np.pad(y, (*beside, (0, 0)))
         free = unit.shape[2]
         x, y = (np.asarray(np.linalg.solve(*pair)) for pair in ((cameras, unit), (points, y)))
         motions = Motions(x, y, np.eye(free), np.zeros((free, 0)))
@@ -82,11 +103,12 @@ class Inverse:
             inverse_roots,
             model=linearizer.model,
             cameras=state[0],
-            points=state[1],
+            points=features,
         )
         lifted = np.swapaxes(cameras, 1, 2) @ unit
-        selected = Selected.held(system, linearizer, motions, unit, lifted)
-        return Inverse(selected, linearizer, state, scale)
+        selected = Selected.held(system, reference, motions, unit, lifted)
+        none = np.zeros((0, 6)) if lines is None else lines
+        return Inverse(selected, linearizer, state, scale, none)
 
     @property
     def layout(self) -> ObservationGraph:
@@ -97,8 +119,14 @@ class Inverse:
         """Return X times vectors (12 n + 4 m, r)."""
         size, layout = 12 * self.layout.n_views, self.layout
         cameras = vectors[:size].reshape(layout.n_views, 12, -1)
-        x, y = self.selected.apply(cameras, vectors[size:].reshape(layout.n_points, 4, -1))
+        x, y = self._apply(cameras, vectors[size:].reshape(layout.n_points, 4, -1))
         return np.concatenate([x.reshape(size, -1), y.reshape(len(vectors) - size, -1)])
+
+    def _apply(self, cameras: Array, points: Array) -> tuple[Array, Array]:
+        """Return X times columns (n, 12, r) and (m, 4, r), without the lines' part."""
+        m = len(points)
+        x, y = self.selected.apply(cameras, np.pad(points, ((0, len(self.lines)), (0, 0), (0, 0))))
+        return x, y[:m]
 
     @property
     def views(self) -> Array:
@@ -115,15 +143,27 @@ class Inverse:
     @property
     def points(self) -> Array:
         """Return the points' diagonal blocks of X, (m, 4, 4)."""
-        return self._marginals[0]
+        return self._marginals[0][: self.layout.n_points]
 
     @cached_property
     def observed(self) -> Array:
         """Return J X J^T of each observation, (N, 2, 2)."""
         layout, (points, couplings) = self.layout, self._marginals
+        view, couplings = layout.view, couplings[: len(layout.view)]
         return self._propagated(
-            layout.view, layout.point, self.views[layout.view], couplings, points[layout.point]
+            view, layout.point, self.views[view], couplings, points[layout.point]
         )
+
+    @cached_property
+    def observed_lines(self) -> Array:
+        """Return J X J^T of the distances of each segment's end points, (S, 2, 2)."""
+        reference, (features, couplings) = self.selected.reference, self._marginals
+        assert isinstance(reference, FeatureLinearizer)
+        graph = reference.of_lines.graph
+        _, J_camera, J_line = reference.of_lines.observe(self.state[0], self.lines)
+        J = J_camera.transpose(2, 0, 1), J_line.transpose(2, 0, 1)
+        own = features[self.layout.n_points + graph.point]
+        return _combined(*J, self.views[graph.view], couplings[len(self.layout.view) :], own)
 
     def projected(self, views: Indices, points: Indices) -> Array:
         """Return J X J^T of any points in any views, (k, 2, 2)."""
@@ -142,11 +182,7 @@ class Inverse:
         self, views: Indices, points: Indices, X_ii: Array, X_ij: Array, X_jj: Array
     ) -> Array:
         """Return J X J^T of points in views from the blocks of X."""
-        J_camera, J_point = self.jacobians(views, points)
-        mixed = J_camera @ X_ij @ np.swapaxes(J_point, 1, 2)
-        found = J_camera @ X_ii @ np.swapaxes(J_camera, 1, 2)
-        found = found + J_point @ X_jj @ np.swapaxes(J_point, 1, 2)
-        return np.asarray(found + mixed + np.swapaxes(mixed, 1, 2))
+        return _combined(*self.jacobians(views, points), X_ii, X_ij, X_jj)
 
     def pull(self, observations: Indices, psi: Array) -> Array:
         """Return how far residuals (N, 2) move when forces psi (k, 2) on some are taken off."""
@@ -156,7 +192,7 @@ class Inverse:
         cameras, own = np.zeros((layout.n_views, 12)), np.zeros((layout.n_points, 4))
         np.add.at(cameras, views, np.einsum("kij,ki->kj", J_camera, psi))
         np.add.at(own, points, np.einsum("kij,ki->kj", J_point, psi))
-        x, y = (part[..., 0] for part in self.selected.apply(cameras[..., None], own[..., None]))
+        x, y = (part[..., 0] for part in self._apply(cameras[..., None], own[..., None]))
         J_camera, J_point = self.jacobians(layout.view, layout.point)
         moves = np.einsum("kij,kj->ki", J_camera, x[layout.view])
         return np.asarray(moves + np.einsum("kij,kj->ki", J_point, y[layout.point]))
@@ -171,9 +207,18 @@ class Inverse:
         return J_P.transpose(2, 0, 1), J_Q.transpose(2, 0, 1)
 
 
+def _combined(J_camera: Array, J_point: Array, X_ii: Array, X_ij: Array, X_jj: Array) -> Array:
+    """Return J X J^T, (k, 2, 2), from Jacobians and blocks of X."""
+    mixed = J_camera @ X_ij @ np.swapaxes(J_point, 1, 2)
+    found = J_camera @ X_ii @ np.swapaxes(J_camera, 1, 2)
+    found = found + J_point @ X_jj @ np.swapaxes(J_point, 1, 2)
+    return np.asarray(found + mixed + np.swapaxes(mixed, 1, 2))
+
+
 def _normal(linearizer: NumpyLinearizer, state: tuple[Array, Array]) -> Normal:
     """Return the normal equations; where the library can, nothing of an observation is stored."""
-    if not linearizer.kernels.compiled or linearizer.whitening is not None:
+    stored = linearizer.whitening is not None or isinstance(linearizer, FeatureLinearizer)
+    if not linearizer.kernels.compiled or stored:
         return linearizer.linearize(*state)
     parts = linearizer.model, linearizer.graph, linearizer.q, linearizer.weights, linearizer.loss
     normal = NativeLinearizer(*parts).linearize(*state)

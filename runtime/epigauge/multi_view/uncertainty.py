@@ -35,6 +35,7 @@ from epigauge.multi_view.datum import Projector, halves, mapped, projector
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import Gauge, identity, normalized, two_cameras
 from epigauge.multi_view.inverse import Inverse
+from epigauge.multi_view.line_start import seen_lines
 from epigauge.multi_view.line_tracks import LineTracks
 from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.sandwich import Sandwich
@@ -113,7 +114,7 @@ class ReconstructionCovariance(Result):
         ReconstructionCovariance
             In the gauge, with the reconstruction moved there.
         """
-        P, Q = self.reconstruction.P, self.reconstruction.Q
+        P, Q, lines = (getattr(self.reconstruction, name) for name in ("P", "Q", "lines"))
         there = gauge.transformation(P, Q)
         moved = there.apply(P, Q)
         cameras, points = there.blocks()
@@ -121,7 +122,7 @@ class ReconstructionCovariance(Result):
         there_too = projector(gauge, *moved)
         inside = replace(
             self,
-            reconstruction=Reconstruction(*moved),
+            reconstruction=Reconstruction(*moved, None if lines is None else there.lines(lines)),
             projector=there_too,
             _maps=maps,
             _wander=None,
@@ -206,6 +207,20 @@ class ReconstructionCovariance(Result):
         """
         return np.asarray(self.noise_px**2 * self._inverse.observed)
 
+    @cached_property
+    def line_projections(self) -> Array:
+        """Return what the distances of `BundleResult.line_fun` are uncertain by, (S, 2, 2).
+
+        The covariance of the distances of both end points of each segment from the projected line,
+        over their standard deviations: the line and the camera are uncertain, the segment is not.
+        It is the same in every gauge.
+        """
+        if self.reconstruction.lines is None:
+            return np.zeros((0, 2, 2))
+        inverse = self._inverse
+        assert isinstance(inverse, Inverse)
+        return np.asarray(self.noise_px**2 * inverse.observed_lines)
+
     def of_projections(self, view: ArrayLike, point: ArrayLike) -> Array:
         """Return the covariance of points projected to views where they need not be observed.
 
@@ -274,6 +289,7 @@ def covariance(
     *,
     loss: str = "linear",
     loss_scale_px: float | str = "auto",
+    lines: LineTracks | None = None,
     backend: str | None = None,
 ) -> ReconstructionCovariance: ...
 
@@ -354,7 +370,8 @@ def covariance(
         Where the formulas are computed.
     **of_metric
         Of a metric reconstruction `refine`, `fixed_views`, `fixed_points`, `priors` and `lines`, as
-        they were given to `bundle_adjust`; of an affine one `fixed_views` and `fixed_points`. With
+        they were given to `bundle_adjust`; of an affine one `fixed_views` and `fixed_points`; of a
+        projective one `lines`, with the linear loss. With
         lines the noise is that of both: an end point of a segment is as much more or less exact
         than a point as the `sigma` of tracks and segments say.
 
@@ -409,19 +426,25 @@ def covariance(
         was = f"is a {type(reconstruction).__name__}"
         needed = "an eg.Reconstruction, MetricReconstruction or AffineReconstruction"
         raise ArgumentError("reconstruction", was, needed)
+    if reconstruction.lines is not None and of_metric.get("lines") is None:
+        was = f"has {len(reconstruction.lines)} lines, which count as observations, too"
+        needed = "their segments, lines=...; or one adjusted to points alone"
+        raise ArgumentError("reconstruction", was, needed)
     if isinstance(reconstruction, MetricReconstruction):
-        if reconstruction.lines is not None and of_metric.get("lines") is None:
-            was = f"has {len(reconstruction.lines)} lines, which count as observations, too"
-            needed = "their segments, lines=...; or one adjusted to points alone"
-            raise ArgumentError("reconstruction", was, needed)
         datum = "inner" if gauge is None else gauge
         options: Any = {**of_metric, "backend": backend}
         options |= {"loss": loss, "loss_scale_px": loss_scale_px}
         return metric_covariance(tracks, reconstruction, datum, noise_px, **options)
+    lines = of_metric.pop("lines", None)
     if of_metric:
         raise ArgumentError(
             next(iter(of_metric)), "is given with a projective reconstruction", "a metric one"
         )
+    if lines is not None and reconstruction.lines is None:
+        was = "is given, and the reconstruction has no lines"
+        raise ArgumentError("lines", was, "what was adjusted: eg.bundle_adjust(..., lines=lines)")
+    if lines is not None and as_choice("loss", loss, LOSSES) != "linear":
+        raise ArgumentError("loss", f"is {loss!r} with lines of projective cameras", "'linear'")
     P, Q = reconstruction.P, reconstruction.Q
     n, m = len(P), len(Q)
     if (n, m) != (tracks.n_views, tracks.n_points):
@@ -445,14 +468,24 @@ def covariance(
     moved_P, moved_Q = home.apply(frame.cameras_in(P), Q)
     state = moved_P.reshape(-1, 12), moved_Q
     cost = 0.5 * float(np.sum(linearizer.point_costs(*state)))
+    segments, moved_lines = None, None
+    if lines is not None:
+        assert reconstruction.lines is not None
+        if len(reconstruction.lines) != lines.n_lines:
+            was = f"has {len(reconstruction.lines)} lines"
+            raise ArgumentError("reconstruction", was, f"{lines.n_lines}, as lines")
+        seen = seen_lines("reconstruction", lines, reconstruction, tracks.unit, frame)
+        segments, moved_lines = seen.linearizer(table), home.lines(reconstruction.lines)
+        cost += 0.5 * float(np.sum(segments.point_costs(state[0], moved_lines)))
     if noise_px is not None:
         noise_px = as_positive("noise_px", noise_px)
     elif found is None:
         redundancy = 2 * int(np.count_nonzero(tracks.weights)) - 11 * n - 3 * m + 15
+        redundancy += 0 if lines is None else 2 * len(lines) - 4 * lines.n_lines
         if redundancy <= 0:
             raise ArgumentError("noise_px", "is not given", "a number: nothing is redundant")
         noise_px = frame.scale * float(np.sqrt(2.0 * cost / redundancy))
-    inverse = Inverse.of(linearizer, state, frame.scale)
+    inverse = Inverse.of(linearizer, state, frame.scale, segments, moved_lines)
     whole: Inverse | Sandwich = inverse
     if found is not None:
         influence = _influence(found, inverse, tracks.whitening)

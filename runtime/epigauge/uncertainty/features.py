@@ -1,7 +1,7 @@
 """Points and lines as features of one kind, as the inverse of the normal matrix has them.
 
-Rows (m + L, 6): points (X, 0, 0, 0), then lines. Their tangents have four entries; the last one of
-a point moves nothing, and no unknown moves it.
+Rows (m + L, 6): points, filled up with zeros, then lines. Their tangents have four entries, as
+homogeneous points have; the last one of a point (x, y, z) moves nothing, and no unknown moves it.
 """
 
 from __future__ import annotations
@@ -63,15 +63,21 @@ class FeatureLinearizer(NumpyLinearizer):
 
     @staticmethod
     def rows(points: Array, lines: Array) -> Array:
-        """Return points (m, 3) and lines (L, 6) as rows (m + L, 6)."""
+        """Return points (m, b) and lines (L, 6) as rows (m + L, 6)."""
         found = np.zeros((len(points) + len(lines), _ROW))
-        found[: len(points), :3], found[len(points) :] = points, lines
+        found[: len(points), : points.shape[1]], found[len(points) :] = points, lines
         return found
 
     def split(self, features: Array) -> tuple[Array, Array]:
-        """Return points (m, 3) and lines (L, 6)."""
-        m = self.of_points.graph.n_points
-        return np.ascontiguousarray(features[:m, :3]), features[m:]
+        """Return points (m, b) and lines (L, 6)."""
+        m, size = self.of_points.graph.n_points, self.model.point_size
+        return np.ascontiguousarray(features[:m, :size]), features[m:]
+
+    def log_depths(self, cameras: Array, points: Array) -> tuple[Array, Array]:
+        """Return Z = d log depth by camera (d, N) and feature (4, N); lines have no depth."""
+        Z = self.of_points.log_depths(cameras, self.split(points)[0])
+        none = len(self.of_lines.graph.view)
+        return tuple(np.pad(part, ((0, 0), (0, none))) for part in Z)  # type: ignore[return-value]
 
     def residuals(self, cameras: Array, points: Array) -> Array:
         """Return the residuals of points, whitened, then those of lines, (2, N)."""
