@@ -4,6 +4,7 @@ computed. Some have more matches than the compiled loop works on at a time (256)
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import epigauge as eg
@@ -215,3 +216,46 @@ def test_distances_are_those_of_the_result_where_the_last_step_was_rejected(back
             if result.status == 0:
                 assert not result.success
     assert rejected > 1
+
+
+def judged_scene(kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return matches that are judged in different ways: see the names."""
+    scene, rng = two_view_scene(6.0, n_points=60, noise_px=0.5, seed=4), np.random.default_rng(4)
+    x1, x2 = scene.x1.copy(), scene.x2.copy()
+    noise = 0.3 * rng.standard_normal(x1.shape)
+    if kind == "plane":
+        x2 = x1 @ [[1.1, 0.1], [-0.1, 0.9]] + [20.0, 5.0] + noise
+    elif kind == "line":
+        x1 = rng.uniform(0.0, 500.0, (60, 1)) * [1.0, 0.4] + noise
+        x2 = 0.8 * x1 + [30.0, -9.0] + 0.2 * rng.standard_normal(x1.shape)
+    elif kind == "random":
+        x2 = rng.uniform(0.0, 500.0, x1.shape)
+    elif kind == "gross errors":
+        x2[:3] += 90.0
+    return x1, x2
+
+
+@pytest.mark.parametrize("kind", ["scene", "plane", "line", "random", "gross errors"])
+@pytest.mark.parametrize("factor", [2.0**-20, 2.0**20])
+def test_a_common_factor_of_the_weights_changes_no_verdict(kind: str, factor: float) -> None:
+    """Powers of two leave every digit as it is: noise is that of weight one, flags are of all."""
+    x1, x2 = judged_scene(kind)
+    weights = np.random.default_rng(5).uniform(0.5, 2.0, len(x1))
+    ways: list[Any] = [
+        lambda w: eg.refine_fundamental(x1, x2, weights=w),
+        lambda w: eg.refine_fundamental(x1, x2, weights=w, loss="huber"),
+    ]
+    if kind == "scene":
+        ways.append(lambda w: eg.estimate_fundamental(x1, x2, weights=w))
+    batches = [
+        eg.refine_fundamental_batch(x1, x2, [0, len(x1)], weights=w)
+        for w in (weights, factor * weights)
+    ]
+    assert batches[0].flags == batches[1].flags
+    for run in ways:
+        one, other = run(weights), run(factor * weights)
+        assert one.flags == other.flags
+        assert one.success == other.success
+        if kind != "gross errors":  # which a robust loss leaves out
+            assert one.success == (kind == "scene")
+        assert other.noise_px == pytest.approx(math.sqrt(factor) * one.noise_px, rel=1e-3)

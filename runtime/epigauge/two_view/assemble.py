@@ -39,7 +39,7 @@ def assembled(
     """Bring the solution back to pixels and add what follows from it."""
     solution, frame, weights = found.solution, matches.frame, matches.weights
     if options.bias_correction:
-        noise = found.evidence.noise if noise_px is None else noise_px / frame.scale
+        noise = found.evidence.noise_of_weight_one if noise_px is None else noise_px / frame.scale
         solution = _corrected(solution, matches, noise)
     outcome, chart = solution.outcome, solution.chart
     reprojection = matches.reprojection()
@@ -69,7 +69,8 @@ def assembled(
     derivatives = chart.derivatives(solution.motion)[0]
     residual = residual_noise(distances.signed, weights, loss, chart.dimension)
     if noise_px is None:
-        noise = found.evidence.noise if matches.covariances is None else residual
+        own = found.evidence.noise_of_weight_one
+        noise = own if matches.covariances is None else residual
         redundant = int(np.count_nonzero(weights > 0.0)) > chart.dimension
         noise_px = noise * frame.scale if redundant else float("inf")
     a, b = influence(distances.signed, weights, loss, chart.dimension, residual)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -53,7 +54,7 @@ class Evidence:
     to_units1, to_units2 : ndarray, shape (3, 3)
         Maps of the images from pixels to these coordinates.
     noise : float
-        Standard deviation of a coordinate of weight one, from the residuals of the inliers.
+        Standard deviation of a coordinate of the median weight, from the residuals of the inliers.
     parameters : int
         Number of parameters of F.
     retina : bool
@@ -96,6 +97,11 @@ class Evidence:
     def weights(self) -> Array:
         """Weights of the inliers, shape (m,)."""
         return self.all_weights[self.inlier]
+
+    @property
+    def noise_of_weight_one(self) -> float:
+        """Standard deviation of a coordinate whose weight was given as one."""
+        return self.noise * math.sqrt(self.unit)
 
     @cached_property
     def _corrected(self) -> tuple[Array, Array, Array]:
@@ -177,7 +183,7 @@ def evidence(
         unexplained = weights * motion.excess[counts] > (WITHIN * noise) ** 2
         n_behind = int(np.count_nonzero(inlier & unexplained))
     weights, unit = of_median_one(weights)
-    noise /= float(np.sqrt(unit))
+    noise /= math.sqrt(unit)
     return Evidence(
         table=matches.table,
         F=solution.F,

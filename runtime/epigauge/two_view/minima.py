@@ -197,7 +197,7 @@ def chosen(matches: Matches, options: Options, found: list[Solution]) -> Search:
         costs = np.array([2.0 * _cost(group[0]) for group in groups])
         first = int(np.argmin(log_cost(costs, m) + doubts))
     best = groups[first][0]
-    noise_px = cases[first].noise * matches.frame.scale
+    noise_px = cases[first].noise_of_weight_one * matches.frame.scale
     bound = minima[first].cost + 0.5 * AMBIGUOUS * noise_px**2
     rivals = sum(minimum.oriented and minimum.cost <= bound for minimum in minima)
     history = found[0].outcome.history

@@ -208,8 +208,7 @@ class FundamentalResult(Partial):
         # Where nothing is redundant the noise is not known: "few matches".
         largest = self._uncertainty.largest() if np.isfinite(self.noise_px) else 0.0
         if np.isfinite(largest) and 0.0 < self.noise_px < np.inf:
-            noise = found.noise * np.sqrt(found.unit)
-            largest *= noise / found.to_units1[0, 0] / self.noise_px
+            largest *= found.noise_of_weight_one / found.to_units1[0, 0] / self.noise_px
         flags = diagnose(found, largest, self.ambiguous)
         usable = verdicts.usable(flags, "F" if self.E is None else "E")
         return SimpleNamespace(flags=flags, success=self.status > 0 and usable)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from functools import cache, partial
@@ -370,7 +371,8 @@ def _rest(refined: FundamentalResult, limit_px: float | None) -> SimpleNamespace
     known = {name: getattr(refined, name) for name in names}
     if limit_px is not None and refined.noise_px > 0.0:
         # The threshold has cut off the tails of the right matches.
-        noise_px = untruncated(refined.noise_px, limit_px)
+        unit = math.sqrt(refined._evidence.unit)  # the limit is one of distances
+        noise_px = unit * untruncated(refined.noise_px / unit, limit_px)
         factor = noise_px / refined.noise_px
         spread = replace(refined._uncertainty, root=factor * refined._uncertainty.root)
         known |= {"noise_px": noise_px, "_uncertainty": spread}
