@@ -50,6 +50,58 @@ def rows(tracks: Any) -> set[tuple[float, ...]]:
     return set(map(tuple, table.tolist()))
 
 
+# ---------------------------------------------------------------- other forms
+
+
+@pytest.fixture(params=["parquet", "zarr"])
+def other(request: pytest.FixtureRequest, scene: Scene, tmp_path: Path) -> Path:
+    """Return a folder of another form than NPZ."""
+    pytest.importorskip({"parquet": "pyarrow"}.get(request.param, request.param))
+    tracks, start = scene
+    spread = np.array([[1.0, 0.3], [0.3, 0.5]])
+    oblong = eg.Tracks(tracks.view, tracks.point, tracks.xy, covariance=spread)
+    return eg.distributed.write_parts(oblong, tmp_path / "other", start, storage=request.param)
+
+
+def test_every_form_holds_the_same_bits(scene: Scene, other: Path, tmp_path: Path) -> None:
+    tracks, start = scene
+    spread = np.array([[1.0, 0.3], [0.3, 0.5]])
+    oblong = eg.Tracks(tracks.view, tracks.point, tracks.xy, covariance=spread)
+    npz = eg.distributed.write_parts(oblong, tmp_path / "npz", start)
+    for own, expected in zip(Parts.open(other).parts, Parts.open(npz).parts, strict=True):
+        found, wanted = own.read(), expected.read()
+        pairs = [(found.number, wanted.number), (found.X, wanted.X)]
+        for name in ("view", "point", "q", "weights", "whitening"):
+            pairs.append(tuple(getattr(part.observations, name) for part in (found, wanted)))
+        for left, right in pairs:
+            assert (left.dtype, left.shape) == (right.dtype, right.shape)
+            assert left.tobytes() == right.tobytes()
+        assert own.points()[1].tobytes() == wanted.X.tobytes()
+
+
+def test_damage_of_every_form_is_named(other: Path) -> None:
+    first, *_, last = sorted(other.glob("part-*"))
+    whole, row = first.read_bytes(), Parts.open(other).parts[0]
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    for damaged in (whole[:200], bytes(len(whole)), bytes(flipped), b""):
+        first.write_bytes(damaged)
+        with pytest.raises(FileFormatError, match=first.name):
+            row.read()
+    first.unlink()
+    with pytest.raises(FileFormatError, match=first.name):
+        row.read()
+    shutil.copyfile(last, first)
+    with pytest.raises(FileFormatError, match=first.name):
+        row.read()
+
+
+def test_a_form_that_is_unknown_is_named(scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(eg.ArgumentError, match="storage"):
+        eg.distributed.write_parts(scene[0], tmp_path / "x", scene[1], storage="hdf5")
+    assert not (tmp_path / "x").exists()
+
+
 # ---------------------------------------------------------------- what is written
 
 

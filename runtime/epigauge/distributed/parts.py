@@ -1,7 +1,7 @@
 """Scenes in folders of parts: no process has to hold all observations.
 
 A folder has ``parts.json``, which lists the parts and says what all of them have in common;
-``cameras.npz``; and the parts, NPZ files each with some points and all of their observations.
+``cameras.npz``; and the parts, files each with some points and all of their observations.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from epigauge._arguments import MAX_PX, MAX_WEIGHT
 from epigauge.cameras import Cameras, MetricReconstruction
 from epigauge.distributed.observations import Observations
+from epigauge.distributed.part_files import STORAGES, read_part
 from epigauge.errors import EpigaugeError, FileFormatError
 from epigauge.io._common import PathLike, cut
 from epigauge.io._npz import read_npz
@@ -137,12 +138,7 @@ class Part:
             "weights": ("f", (N,)),
             "whitening": ("f", (N, 2, 2)),
         }
-        path = Path(self.path)
-        try:
-            with path.open("rb") as file:
-                found = read_npz(path, file, [names])
-        except OSError as error:  # a worker's: not to be taken for its loss
-            raise self.fault(f"cannot be read: {error.strerror or error}") from None
+        found = read_part(Path(self.path), names)
         if found["scene"].tobytes().hex() != self.scene:
             raise self.fault("is a part of another scene than the manifest's")
         for name in names:
@@ -193,6 +189,11 @@ class Parts:
     scale: float
     whitened: bool
     names: tuple[str, ...] | None = None
+
+    @property
+    def storage(self) -> str:
+        """Return the form of the files."""
+        return Path(self.parts[0].path).suffix[1:]
 
     @staticmethod
     def open(folder: PathLike) -> Parts:
@@ -274,7 +275,7 @@ class Parts:
 def is_parts(path: PathLike) -> bool:
     """Tell whether a path is a folder of parts, finished or not."""
     folder = Path(path)
-    return folder.is_dir() and ((folder / MANIFEST).exists() or any(folder.glob("part-[0-9]*.npz")))
+    return folder.is_dir() and ((folder / MANIFEST).exists() or any(folder.glob("part-[0-9]*.*")))
 
 
 def _parts(folder: Path, found: dict[str, Any]) -> tuple[Parts, list[int]]:
@@ -286,6 +287,8 @@ def _parts(folder: Path, found: dict[str, Any]) -> tuple[Parts, list[int]]:
         name = str(row["file"])
         if Path(name).name != name:
             raise ValueError(f"file {name!r} is not in the folder")
+        if Path(name).suffix[1:] not in STORAGES:
+            raise ValueError(f"file {name!r} is none of {', '.join(STORAGES)}")
         size, points, seen = (int(row[key]) for key in ("bytes", "n_points", "n_observations"))
         if not 0 < points <= seen <= size:  # no more is allocated than there can be
             raise ValueError(f"{points} points, {seen} observations in {size} bytes of {name!r}")

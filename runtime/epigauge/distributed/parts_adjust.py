@@ -201,7 +201,7 @@ def adjust_parts(
     writer = None
     if output is not None:  # which is begun when all else is known to be right
         common = parts.unit, parts.whitened, parts.names
-        writer = PartsWriter.new(output, parts.n_views, *common, name="output")
+        writer = PartsWriter.new(output, parts.n_views, *common, "output", parts.storage)
     outcome, cameras, points = minimized(
         job,
         graph,

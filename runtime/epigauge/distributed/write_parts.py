@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epigauge._arguments import MAX_PX, as_array, as_count, as_real, as_weights
+from epigauge._arguments import MAX_PX, as_array, as_choice, as_count, as_real, as_weights
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.cameras import MetricReconstruction
 from epigauge.distributed.observations import Observations
+from epigauge.distributed.part_files import STORAGES, write_part
 from epigauge.distributed.parts import CAMERAS, FORM, MANIFEST, PartArrays
 from epigauge.distributed.pieces import cut
 from epigauge.errors import ArgumentError
@@ -72,6 +73,7 @@ def write_parts(
     *,
     partitions: int | None = None,
     names: Sequence[str] | None = None,
+    storage: str = "npz",
 ) -> Path:
     """Write a scene as a folder of parts, which `epigauge.distributed.bundle_adjust` adjusts.
 
@@ -89,6 +91,9 @@ def write_parts(
         Of tracks: how many parts; by default one for each 250,000 observations, at least 8.
     names : sequence of str, optional
         Of the views; by default those of the tracks.
+    storage : {"npz", "parquet", "zarr"}
+        Form of the parts. Parquet, a row a point with lists of its observations, needs pyarrow;
+        Zarr, a group in a ZIP file, needs zarr. All hold the same bits.
 
     Returns
     -------
@@ -101,6 +106,8 @@ def write_parts(
         On tracks or chunks that cannot be adjusted so: repeated sightings, weights of zero, points
         seen by fewer than two views, views without observations, views not tied to the others,
         and folders that hold something.
+    MissingPackageError
+        If the form needs a package that is not installed.
     OSError
         If it cannot be written.
 
@@ -144,7 +151,8 @@ def write_parts(
             raise ArgumentError("partitions", "is given with chunks", "one chunk for each part")
         named, unit, whitened = names, 1.0, False
         arrays = _of_chunks(source, start.n_views)
-    writer = PartsWriter.new(folder, start.n_views, unit, whitened, named)
+    as_choice("storage", storage, tuple(STORAGES))
+    writer = PartsWriter.new(folder, start.n_views, unit, whitened, named, storage=storage)
     for part in arrays:
         writer.add(part)
     writer.finish(start)
@@ -167,6 +175,8 @@ class PartsWriter:
         Whether measurements have covariances.
     names : tuple of str or None
         Of the views.
+    storage : str
+        Form of the parts.
     """
 
     folder: Path
@@ -174,6 +184,7 @@ class PartsWriter:
     unit: float
     whitened: bool
     names: tuple[str, ...] | None
+    storage: str = "npz"
     scene: bytes = field(default_factory=lambda: secrets.token_bytes(16))
     heaviest: float = 0.0
     _rows: list[dict[str, Any]] = field(default_factory=list)
@@ -193,6 +204,7 @@ class PartsWriter:
         whitened: bool,
         names: Sequence[str] | None,
         name: str = "folder",
+        storage: str = "npz",
     ) -> PartsWriter:
         """Begin a folder, which must be new or empty; `name` is what errors call it."""
         if not isinstance(folder, str | os.PathLike):
@@ -205,12 +217,12 @@ class PartsWriter:
             raise ArgumentError(name, f"{str(folder)!r} holds something", "a new one")
         folder.mkdir(exist_ok=True)
         known = None if names is None else view_names(names, n_views)
-        return cls(folder, n_views, unit, whitened, known)
+        return cls(folder, n_views, unit, whitened, known, storage)
 
     def add(self, part: PartArrays) -> None:
         """Write a part."""
         own = part.observations
-        name = f"part-{len(self._rows):05d}.npz"
+        name = f"part-{len(self._rows):05d}.{self.storage}"
         arrays: dict[str, Any] = {
             "scene": np.frombuffer(self.scene, np.uint8),
             "number": part.number,
@@ -222,8 +234,7 @@ class PartsWriter:
         }
         if own.whitening is not None:
             arrays["whitening"] = np.ascontiguousarray(own.whitening.transpose(2, 0, 1))
-        with writing(self.folder / name) as file:
-            write_npz(file, arrays, compressed=False)
+        write_part(self.folder / name, arrays)
         size = (self.folder / name).stat().st_size
         counts = {"n_points": len(part.X), "n_observations": len(own)}
         self._rows.append({"file": name, "bytes": size, **counts})
