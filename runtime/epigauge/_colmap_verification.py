@@ -20,6 +20,7 @@ from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._common import PathLike
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.consensus import Consensus
+from epigauge.two_view.copies import earliest
 from epigauge.two_view.essential import Calibrated
 from epigauge.two_view.homography import fit_homography, robust_homography
 from epigauge.two_view.refine import plan_of
@@ -174,7 +175,7 @@ def verify_database(
     backup : bool
         Copy the database first, to a new file beside it.
     min_inliers : int
-        Pairs with fewer inliers are degenerate; at least eight.
+        Pairs with fewer different inliers are degenerate; at least eight.
     threshold_px : float or "auto"
         Largest distance of an inlier, as of `estimate_fundamental`.
     seed : int
@@ -310,8 +311,10 @@ def _verified(
 
     if pair.reason:
         return told(-1, note=pair.reason)
-    if len(pair.matches) < min_inliers:
-        return told(_DEGENERATE, note=f"{len(pair.matches)} matches")
+    # Copies tell nothing more.
+    different = len(np.unique(earliest(*map(np.ascontiguousarray, (pair.x1, pair.x2)))))
+    if different < min_inliers:
+        return told(_DEGENERATE, note=f"{different} matches")
     try:
         result = estimated(
             pair.x1, pair.x2, "auto", threshold_px, None, seed, {"backend": backend}
@@ -320,7 +323,7 @@ def _verified(
         return told(_DEGENERATE, note=str(error))
     flags, inlier, noise = result.flags, result.inlier, result.rms_px * _per_coordinate(result)
     note = ", ".join(flags)
-    count = int(np.count_nonzero(inlier))
+    count = min(int(np.count_nonzero(inlier)), len(result.used))
     if not _NOTHING.isdisjoint(flags) or count < min_inliers:
         return told(_DEGENERATE, note=note or f"{count} inliers")
     if pair.bend_px > max(_BENT * noise, _BENT_PX):

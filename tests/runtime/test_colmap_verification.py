@@ -344,10 +344,11 @@ def test_without_cameras_pairs_are_uncalibrated(copied, statement) -> None:
 def test_few_and_equal_matches_are_degenerate(tmp_path) -> None:
     x1, x2 = matches("general", 0)
     equal = np.repeat(x1[:1], 40, axis=0), np.repeat(x2[:1], 40, axis=0)
-    path = database(tmp_path / "few.db", [(x1[:10], x2[:10]), equal])
+    copies = np.repeat(x1[:10], 4, axis=0), np.repeat(x2[:10], 4, axis=0)
+    path = database(tmp_path / "few.db", [(x1[:10], x2[:10]), equal, copies])
     found = eg.colmap.verify_database(path)
-    assert found.config.tolist() == [1, 1]
-    assert found.note[0] == "10 matches"
+    assert found.config.tolist() == [1, 1, 1]
+    assert found.note[0] == found.note[2] == "10 matches"
 
 
 @pytest.mark.parametrize(

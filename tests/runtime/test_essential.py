@@ -8,7 +8,7 @@ import pytest
 from epigauge.errors import ArgumentError
 from epigauge.two_view.essential import Calibrated, in_front
 from epigauge.two_view.five_point import essential_5point
-from two_views import Array
+from two_views import Array, algebraic
 
 F_TELE = 11365.0
 K_TELE = np.array([[F_TELE, 0.0, 1280.0], [0.0, F_TELE, 960.0], [0.0, 0.0, 1.0]])
@@ -279,3 +279,17 @@ def test_in_front_agrees_with_depths_by_least_squares() -> None:
     expected = (depth > 0.0) & (Y[:, 2] > 0.0)
     assert 20 < expected.sum() < 180
     np.testing.assert_array_equal(in_front(R, t, rays1, Y / Y[:, 2:]), expected)
+
+
+@pytest.mark.parametrize("m", [5, 6, 7])
+def test_raw_matches_from_five_on(m: int) -> None:
+    """Five exact matches end with a motion of theirs; copies count once, and four are refused."""
+    view = eg.two_view_scene(4.0, n_points=m, noise_px=0.0, seed=m)
+    K = np.diag([1000.0, 1000.0, 1.0])
+    twice = [np.repeat(x, 2, axis=0) for x in (view.x1, view.x2)]
+    result = eg.estimate_essential(*twice, K)
+    assert result.start == "5point"
+    np.testing.assert_allclose(algebraic(result.F, view.x1, view.x2), 0.0, atol=1e-6)
+    assert "few matches" in result.flags
+    with pytest.raises(eg.ArgumentError, match="4 different matches"):
+        eg.estimate_essential(*(np.repeat(x[:4], 2, axis=0) for x in (view.x1, view.x2)), K)

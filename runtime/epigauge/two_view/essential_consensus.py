@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 from epigauge.two_view.consensus import Agreement, Consensus
 from epigauge.two_view.essential import Calibrated, Essential
@@ -25,6 +26,9 @@ _ROUNDS = 3
 
 #: An improvement of the likelihood that is worth another round.
 _CLIMBED = 1e-3
+
+#: Standard deviation of the noise, conditioned, that few matches are judged with.
+_BLIND = 0.01
 
 
 class EssentialConsensus(Consensus):
@@ -48,6 +52,13 @@ class EssentialConsensus(Consensus):
         super().__init__(kernels, q1, q2)
         self.cameras = Calibrated(q1, q2, A1, A2)
         self.chart = Remapped(Essential(kernels, self.cameras.rays(q1, q2)), A1, A2)
+
+    def of_few(self) -> Agreement:
+        """Return the agreement to begin from with five to seven matches, which leave F open."""
+        found = essential_starts(self.cameras, np.ones(self.cameras.q1.shape[1]), 1)
+        if not found:
+            raise ArgumentError("x1, x2", "leave the motion open", "matches in general position")
+        return self.judge(found[0], _BLIND)
 
     def search(self, starts: Iterable[Agreement], rng: np.random.Generator) -> Agreement:
         """Climb from what five of the matches that agree with a start lead to."""

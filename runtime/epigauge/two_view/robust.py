@@ -64,8 +64,8 @@ class RobustResult(FundamentalResult):
     rounds : int
         How many times F was refined before the inliers stood still.
     start : str
-        Front end that gave the start: "native", "poselib", "opencv", or "8point" where it found
-        nothing.
+        Front end that gave the start: "native", "poselib", "opencv"; "8point" where it found
+        nothing, "5point" of fewer than eight matches.
     error_px : float
         Half of the geometries found from such matches have a median error below, if they are that
         of the scene: the median distance of true matches to their epipolar lines.
@@ -249,8 +249,8 @@ def estimated(
 
     first = earliest(x1, x2)
     rows = np.flatnonzero(first == np.arange(len(x1)))
-    if len(rows) < 8:
-        raise ArgumentError("x1, x2", f"hold {len(rows)} different matches", "at least 8")
+    if len(rows) < least:
+        raise ArgumentError("x1, x2", f"hold {len(rows)} different matches", f"at least {least}")
     copies = np.searchsorted(rows, first)
     promise = promise if promise is None else promise[rows]
     y1, y2 = x1[rows], x2[rows]
@@ -259,10 +259,13 @@ def estimated(
     table, q = kernels.table(options.get("backend")), frame.forward(y1, y2)
     consensus = Consensus(table, *q)
     given = None if threshold is None else threshold / frame.scale
-    name, agreement = start(consensus, table, front_end, given, promise, seed)
+    if len(rows) >= 8:
+        name, agreement = start(consensus, table, front_end, given, promise, seed)
     if calibration is not None:
         maps = zip(frame.maps_from_pixels(), calibration, strict=True)
         consensus = EssentialConsensus(table, *q, *(to_units @ K for to_units, K in maps))
+        if len(rows) < 8:
+            name, agreement = "5point", consensus.of_few()
         agreement = consensus.search([agreement], np.random.default_rng(seed))
 
     options.setdefault("noise_px", None)
