@@ -221,3 +221,82 @@ def test_caches_with_other_counts_are_refused(name: str, tmp_path: Path) -> None
     np.savez(tmp_path / "c.npz", **arrays)
     with pytest.raises(eg.FileFormatError):
         eg.PairwiseMatches.load(tmp_path / "c.npz")
+
+
+def _photographs(folder: Path) -> list[Path]:
+    """Write three photographs of which each has some features."""
+    import cv2
+
+    rng = np.random.default_rng(0)
+    whole = cv2.GaussianBlur(rng.uniform(0.0, 255.0, (220, 300)), (0, 0), 2.0)
+    whole = cv2.normalize(whole, None, 0.0, 255.0, cv2.NORM_MINMAX).astype(np.uint8)
+    paths = [folder / f"{k}.png" for k in range(3)]
+    for k, path in enumerate(paths):
+        cv2.imwrite(str(path), whole[5 * k :, 8 * k : 8 * k + 240])
+    return paths
+
+
+def test_interrupted_matching_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths, cache = _photographs(tmp_path), tmp_path / "matches.npz"
+    plain = eg.match_photographs(paths)
+
+    def stopped(at: str) -> None:
+        def told(what: str, done: int, count: int) -> None:
+            if (what, done) == (at, 2):
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            eg.match_photographs(paths, cache=cache, progress=told)
+
+    partial = tmp_path / "matches.npz.partial"
+    stopped("features")
+    assert len(list(partial.glob("features-*.npz"))) == 2
+    stopped("pairs")
+    assert len(list(partial.glob("features-*.npz"))) == 3
+    assert len(list(partial.glob("matches-*.npz"))) == 1
+    assert not cache.exists()
+    # What is damaged is made anew; the rest is not sought again.
+    next(partial.glob("features-*.npz")).write_bytes(b"PK")
+    sought = []
+    from epigauge.images import pairwise as module
+
+    original = module._features
+    monkeypatch.setattr(
+        module, "_features", lambda *a, **k: (sought.append(a[1]), original(*a, **k))[1]
+    )
+    found = eg.match_photographs(paths, cache=cache)
+    assert len(sought) == 1
+    assert cache.exists()
+    assert not partial.exists()
+    again = eg.match_photographs(paths, cache=cache)
+    assert len(sought) == 1
+    for other in (found, again):
+        assert other.names == plain.names
+        assert all(np.array_equal(a, b) for a, b in zip(other.points, plain.points, strict=True))
+        assert all(np.array_equal(other.pairs[p], rows) for p, rows in plain.pairs.items())
+    with pytest.raises(eg.ArgumentError, match="of other images"):
+        eg.match_photographs(paths[:2], cache=cache)
+
+
+def test_changed_photographs_and_options_are_not_taken_from_an_interrupted_run(
+    tmp_path: Path,
+) -> None:
+    from epigauge.images.unfinished import Unfinished
+
+    paths = _photographs(tmp_path)
+    made = []
+
+    def get(options: dict) -> None:
+        kept = Unfinished(tmp_path / "c.npz", options)
+        kept.get("features", paths[:1], lambda: (made.append(1), {"a": np.arange(3)})[1])
+
+    get({"ratio": 0.8})
+    get({"ratio": 0.8})
+    assert len(made) == 1
+    get({"ratio": 0.7})
+    assert len(made) == 2
+    paths[0].write_bytes(paths[0].read_bytes() + b" ")
+    get({"ratio": 0.8})
+    assert len(made) == 3

@@ -234,6 +234,46 @@ class TestTwoViews:
             F = F @ P[1] @ np.linalg.pinv(P[0])
             assert eg.focal_lengths(F, CENTRE, CENTRE).flag == "undetermined"
 
+    @staticmethod
+    def shared(motion: str, seed: int) -> np.ndarray:
+        """Return F of two views of 900 px."""
+        _, scene = tracks_of(motion, seed, n_views=2)
+        P = scene.P
+        F = np.cross(np.eye(3), P[1] @ np.append(scene.centres[0], 1.0)).T
+        F = F @ P[1] @ np.linalg.pinv(P[0])
+        return F / np.linalg.norm(F)
+
+    @pytest.mark.parametrize("motion", ["general", "axis"])
+    def test_a_shared_focal_length_is_known_where_axes_meet(self, motion: str) -> None:
+        # Axes of the second kind are in one plane: each view's own is open.
+        for seed in range(3):
+            F = self.shared(motion, seed)
+            for matrix in (F, -3.0 * F.T):
+                found = eg.focal_lengths(matrix, CENTRE, CENTRE, centre_std_px=3.0, shared=True)
+                np.testing.assert_allclose(found.focal_px, 900.0, rtol=1e-6)
+                assert found.flag == ""
+
+    @pytest.mark.parametrize("motion", ["point", "translation"])
+    def test_a_shared_focal_length_is_open_at_equal_distances(self, motion: str) -> None:
+        for seed in range(3):
+            found = eg.focal_lengths(self.shared(motion, seed), CENTRE, CENTRE, shared=True)
+            assert found.flag == "undetermined"
+            assert not np.isfinite(found.std_px).any()
+
+    def test_the_deviation_of_a_shared_focal_length_is_the_derivative(self) -> None:
+        F, h = self.shared("general", 1), 1e-3
+        moved = [eg.focal_lengths(F, CENTRE + d, CENTRE, shared=True) for d in h * np.eye(2)]
+        moved += [eg.focal_lengths(F, CENTRE, CENTRE + d, shared=True) for d in h * np.eye(2)]
+        slopes = (np.array([found.focal_px[0] for found in moved]) - 900.0) / h
+        found = eg.focal_lengths(F, CENTRE, CENTRE, centre_std_px=7.0, shared=True)
+        assert found.std_px[0] == pytest.approx(7.0 * np.linalg.norm(slopes), rel=1e-3)
+        away = 1e-7 * np.random.default_rng(0).normal(size=9)
+        G = F + away.reshape(3, 3)
+        change = eg.focal_lengths(G, CENTRE, CENTRE, shared=True).focal_px[0] - 900.0
+        C = np.outer(away, away)
+        only = eg.focal_lengths(F, CENTRE, CENTRE, covariance=C, centre_std_px=0.0, shared=True)
+        assert only.std_px[0] == pytest.approx(abs(change), rel=2e-2)
+
     def test_bad_input_is_named(self) -> None:
         F = np.eye(3)
         for arguments, name in (

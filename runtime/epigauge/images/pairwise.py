@@ -9,6 +9,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from epigauge._arguments import as_count, as_positive
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.images.loading import Image, load_image, opencv
 from epigauge.images.matching import features, seeker
+from epigauge.images.unfinished import Unfinished
 from epigauge.io._common import PathLike
 from epigauge.io.output import writing
 
@@ -174,6 +176,7 @@ def match_photographs(
     ratio: float = 0.8,
     max_size: int = 2400,
     max_features: int = 8000,
+    cache: PathLike | None = None,
     progress: Told | None = None,
 ) -> PairwiseMatches:
     """Find features in photographs, and match them pair by pair.
@@ -192,6 +195,10 @@ def match_photographs(
         sides.
     max_size, max_features : int
         As of `match_images`.
+    cache : path, optional
+        An NPZ file for what is found: read if it exists and is of the same images, else written.
+        Until then a folder of this name with the ending ``.partial`` holds what is done, so that
+        an interrupted run goes on where it was.
     progress : callable, optional
         Called with what is being done, how many of it are done, and of how many.
 
@@ -203,7 +210,7 @@ def match_photographs(
     Raises
     ------
     ArgumentError
-        On fewer than two images, or pairs that are not of them.
+        On fewer than two images, pairs that are not of them, or a cache of other images.
     FileFormatError, OSError, MissingPackageError
         As `load_image`.
 
@@ -222,32 +229,87 @@ def match_photographs(
     ratio = as_positive("ratio", ratio)
     max_features = as_count("max_features", max_features, at_least=8)
     listed = None if pairs == "ranked" else _listed(pairs, len(paths))
-    cv2, found, strongest = opencv(), [], []
+    if cache is not None and Path(cache).exists():
+        return _cached(Path(cache), paths)
+    options: dict[str, Any] = {
+        "detector": detector,
+        "max_size": max_size,
+        "max_features": max_features,
+    }
+    kept = Unfinished(None if cache is None else Path(cache), options | {"ratio": ratio})
+    cv2, found = opencv(), []
     for k, path in enumerate(paths):
         if progress is not None:
             progress("features", k, len(paths))
-        image = load_image(path)
-        x, descriptors, strength = features(
-            cv2, seeker(cv2, detector, max_features), str(path), image, max_size, max_features
-        )
-        x, descriptors, strength = _distinct(x, descriptors, strength)
-        size = image.shape[1], image.shape[0]
-        found.append((size, x, _normalized(descriptors, detector), _colours(image, x)))
-        strongest.append(found[-1][2][np.argsort(-strength, kind="stable")[:_STRONGEST]])
+        make = partial(_features, cv2, path, **options)
+        found.append(kept.get("features", [path], make))
     if listed is None:
+        strongest = [own["descriptors"][own["strongest"]] for own in found]
         listed = _ranked(strongest, ratio, progress)
-    matched = {}
-    for k, (i, j) in enumerate(listed):
-        if progress is not None:
-            progress("pairs", k, len(listed))
-        matched[i, j] = _matched(found[i][2], found[j][2], ratio)
-    return PairwiseMatches(
+    descriptors = [own["descriptors"] for own in found]
+    matched: dict[tuple[int, int], Indices] = {}
+    for i, pairs_of in itertools.groupby(listed, key=lambda pair: pair[0]):
+        others = [j for _, j in pairs_of]
+
+        def told(done: int, before: int = len(matched)) -> None:
+            if progress is not None:
+                progress("pairs", before + done, len(listed))
+
+        make = partial(_matched_with, descriptors, i, others, ratio, told)
+        own = kept.get("matches", [paths[i], *(paths[j] for j in others)], make)
+        matched |= {(i, j): own[str(k)].astype(np.intp) for k, j in enumerate(others)}
+    result = PairwiseMatches(
         names_of(paths),
-        np.array([size for size, *_ in found]),
-        tuple(x for _, x, _, _ in found),
+        np.array([own["size"] for own in found]),
+        tuple(own["points"] for own in found),
         matched,
-        tuple(colours for *_, colours in found),
+        tuple(own["colours"] for own in found),
     )
+    if cache is not None:
+        result.save(cache)
+    kept.done()
+    return result
+
+
+def _cached(cache: Path, paths: list[Path]) -> PairwiseMatches:
+    """Return what a cache holds, if it is of these photographs."""
+    known = PairwiseMatches.load(cache)
+    if [Path(name).name for name in known.names] != [path.name for path in paths]:
+        was = f"is of other images ({', '.join(known.names[:3])}, ...)"
+        raise ArgumentError("cache", was, "another file, or the same photographs in their order")
+    return known
+
+
+def _features(
+    cv2: Any, path: Path, *, detector: str, max_size: int, max_features: int
+) -> dict[str, NDArray[Any]]:
+    """Return what there is to know of one photograph."""
+    image = load_image(path)
+    by = seeker(cv2, detector, max_features)
+    x, descriptors, strength = features(cv2, by, str(path), image, max_size, max_features)
+    x, descriptors, strength = _distinct(x, descriptors, strength)
+    return {
+        "size": np.array([image.shape[1], image.shape[0]]),
+        "points": x,
+        "descriptors": _normalized(descriptors, detector),
+        "colours": _colours(image, x),
+        "strongest": np.argsort(-strength, kind="stable")[:_STRONGEST],
+    }
+
+
+def _matched_with(
+    descriptors: list[NDArray[Any]],
+    i: int,
+    others: list[int],
+    ratio: float,
+    told: Callable[[int], object],
+) -> dict[str, NDArray[Any]]:
+    """Return the matches of one photograph with others, numbered."""
+    found = {}
+    for k, j in enumerate(others):
+        told(k)
+        found[str(k)] = _matched(descriptors[i], descriptors[j], ratio)
+    return found
 
 
 def names_of(paths: list[Path]) -> tuple[str, ...]:

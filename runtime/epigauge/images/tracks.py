@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._arguments import as_count
-from epigauge.errors import ArgumentError, EpigaugeError
+from epigauge.errors import ArgumentError
 from epigauge.images.pairwise import PairwiseMatches, match_photographs
 from epigauge.io._common import PathLike
 from epigauge.multi_view.tracks import MIN_POINTS, MIN_VIEWS, Tracks
-from epigauge.two_view.robust import estimate_fundamental
+from epigauge.two_view.robust_batch import estimate_fundamental_batch
+from epigauge.two_view.tensors import REFUSED
 
 __all__ = ["CheckedPair", "NoTracks", "TrackSource", "build_tracks"]
 
@@ -30,6 +29,9 @@ _WRONG = {"no common geometry"}
 
 #: Flags of a pair that says nothing of where cameras are; its matches make tracks longer only.
 _WITHOUT_PARALLAX = {"planar scene", "pure rotation", "still camera"}
+
+#: Pairs that are verified at a time.
+_PART = 64
 
 #: The right matches of a pair must be this many at least, and this share.
 _LEAST, _SHARE = 15, 0.15
@@ -103,8 +105,7 @@ def build_tracks(
     pairs : "all", "sequential", "ranked" or iterable of (int, int)
         Of photographs, as `match_photographs`.
     cache : path, optional
-        Of photographs: an NPZ file for features and matches, read if it exists and is of the same
-        images, else written.
+        Of photographs: an NPZ file for features and matches, as of `match_photographs`.
     min_inliers : int
         Fewest right matches of a pair that is used.
     seed : int
@@ -144,7 +145,9 @@ def build_tracks(
 
         found = database_matches(images)
     else:
-        found = _photographs(list(images), pairs, cache, progress, options)
+        found = match_photographs(
+            list(images), pairs=pairs, cache=cache, progress=progress, **options
+        )
     checked: list[CheckedPair] = []
     agreed: list[tuple[Array, int, int, Indices]] = []
     parallax = False
@@ -171,58 +174,37 @@ def build_tracks(
     return _merged(found, agreed, source)
 
 
-def _photographs(
-    images: list[PathLike],
-    pairs: str | Iterable[tuple[int, int]],
-    cache: PathLike | None,
-    progress: Callable[[str, int, int], object] | None,
-    options: dict[str, Any],
-) -> PairwiseMatches:
-    """Return features and matches of photographs, from the cache if it is of them."""
-    if cache is not None and Path(cache).exists():
-        known = PairwiseMatches.load(cache)
-        if [Path(name).name for name in known.names] == [Path(path).name for path in images]:
-            return known
-        was = f"is of other images ({', '.join(known.names[:3])}, ...)"
-        raise ArgumentError("cache", was, "another file, or the same photographs in their order")
-    found = match_photographs(images, pairs=pairs, progress=progress, **options)
-    if cache is not None:
-        found.save(cache)
-    return found
-
-
 def _all_verified(
     found: PairwiseMatches,
     seed: int,
     workers: int,
     progress: Callable[[str, int, int], object] | None,
 ) -> Iterator[tuple[tuple[int, int], Indices, _Verdict]]:
-    """Yield each pair, its matches, and what `_verified` says of them, in their order."""
+    """Yield each pair, its matches, and its inliers, their distances, and its flags."""
+    pairs = list(found.pairs.items())
+    for begin in range(0, len(pairs), _PART):
+        part = pairs[begin : begin + _PART]
+        ends = np.cumsum([0, *(len(rows) for _, rows in part)])
+        x1, x2 = (
+            np.concatenate([found.points[pair[side]][rows[:, side]] for pair, rows in part])
+            for side in (0, 1)
+        )
 
-    def verdict(pair: tuple[tuple[int, int], Indices]) -> _Verdict:
-        (i, j), rows = pair
-        return _verified(found.points[i][rows[:, 0]], found.points[j][rows[:, 1]], seed)
-
-    with ThreadPoolExecutor(workers) as pool:
-        verdicts = pool.map(verdict, found.pairs.items())
-        for k, ((images, rows), own) in enumerate(zip(found.pairs.items(), verdicts, strict=True)):
+        def told(done: int, _: int, before: int = begin) -> None:
             if progress is not None:
-                progress("verification", k, len(found.pairs))
-            yield images, rows, own
+                progress("verification", before + done, len(pairs))
 
-
-def _verified(x1: Array, x2: Array, seed: int) -> _Verdict:
-    """Return the inliers of a pair, their distances, and its flags."""
-    none = np.zeros(len(x1), dtype=np.bool_), np.zeros(len(x1))
-    if len(x1) < _LEAST:
-        return *none, ("no common geometry",)
-    try:
-        found = estimate_fundamental(x1, x2, seed=seed)
-    except EpigaugeError:  # too few different ones, or all on a line
-        return *none, ("no common geometry",)
-    distances = np.full(len(x1), np.inf)
-    distances[found.used] = np.linalg.norm(found.fun.reshape(len(found.used), -1), axis=1)
-    return np.asarray(found.inlier), distances, tuple(found.flags)
+        batch = estimate_fundamental_batch(
+            x1, x2, ends, seed=seed, workers=workers, progress=told, flags=True
+        )
+        for k, (images, rows) in enumerate(part):
+            own = slice(int(ends[k]), int(ends[k + 1]))
+            if len(rows) < _LEAST or batch.status[k] == REFUSED:
+                none = np.zeros(len(rows), dtype=np.bool_), np.zeros(len(rows))
+                yield images, rows, (*none, ("no common geometry",))
+            else:
+                verdict = batch.inlier[own], np.abs(batch.distances[own]), batch.flags[k]
+                yield images, rows, verdict
 
 
 def _best(source: TrackSource) -> str:
