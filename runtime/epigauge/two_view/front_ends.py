@@ -50,8 +50,9 @@ _BLUNT = 4.0
 
 #: Of the matches within so many scales of a sharp F, those that move with less than this share of
 #: their neighbours may be of repeated structure. Where a larger share is, all are left out, and
-#: what the others agree on is compared.
-_NEAR, _ASTRAY, _REPEATED = 2.0, 0.3, 0.2
+#: what the others agree on is compared; but not where these hardly move with theirs either, as
+#: points of all depths do not.
+_NEAR, _ASTRAY, _REPEATED, _PLAIN = 2.0, 0.3, 0.2, 0.55
 
 #: That is better where matches move with their neighbours by so much more in all, and those that
 #: only it explains by so much more each than those that only the other does.
@@ -195,8 +196,9 @@ class _Repeats:
     def avoided(self, found: Agreement, order: Rows, seed: int) -> Agreement:
         """Return what matches agree on without those of repeated structure, if that is better."""
         rows, accords = self.near(found)
-        astray = rows[accords < _ASTRAY]
-        if len(astray) <= _REPEATED * len(rows):
+        plain = accords >= _ASTRAY
+        astray = rows[~plain]
+        if len(astray) <= _REPEATED * len(rows) or _mean(accords[plain]) < _PLAIN:
             return found
         kept = np.ones(self.q1.shape[1], np.bool_)
         kept[astray] = False
