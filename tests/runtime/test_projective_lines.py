@@ -191,6 +191,8 @@ def test_bad_lines_and_starts_are_named(scene, start):
     ):
         with pytest.raises(eg.ArgumentError, match=name):
             eg.bundle_adjust(scene.tracks, start, lines=lines, **options)
+    with pytest.raises(eg.ArgumentError, match="metric_upgrade"):
+        lines.pieces(start)
     affine = eg.AffineReconstruction(np.ones((5, 2, 4)), np.zeros((20, 3)))
     with pytest.raises(eg.ArgumentError, match="to_projective"):
         eg.bundle_adjust(scene.tracks, affine, lines=lines)
@@ -272,6 +274,16 @@ def test_covariances_without_the_segments_of_lines_are_refused(scene, adjusted):
     fewer = dataclasses.replace(found, lines=found.lines[:4])
     with pytest.raises(eg.ArgumentError, match="has 4 lines"):
         eg.covariance(scene.tracks, fewer, lines=scene.line_tracks)
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_lines_of_two_views_are_no_reason_to_doubt_the_points(calibrated):
+    scene = eg.line_scene(n_views=2, n_points=40, n_lines=60, seed=12)
+    start = scene.true if calibrated else scene.true.to_projective()
+    options = {"lines": scene.line_tracks} | ({"refine": "pose"} if calibrated else {})
+    found = eg.bundle_adjust(scene.tracks, start, **options)
+    assert np.abs(found.line_fun).max() < 0.05  # four numbers, four distances
+    assert not {"outliers", "gross errors", "wrong segments"} & set(found.flags)
 
 
 def test_files_keep_the_lines(tmp_path, scene, start):

@@ -133,6 +133,9 @@ def line_pieces(lines: LineTracks, reconstruction: MetricReconstruction) -> Arra
     From each end point's line of sight the nearest place on the line is taken; of the places of all
     views the middle half of the views decides where the piece begins and ends.
     """
+    if not isinstance(reconstruction, MetricReconstruction):
+        was = f"is a {type(reconstruction).__name__}, in which pieces have no place"
+        raise ArgumentError("reconstruction", was, "an eg.MetricReconstruction: eg.metric_upgrade")
     segments = segments_of(lines, reconstruction)
     if reconstruction.lines is None or len(reconstruction.lines) != lines.n_lines:
         count = 0 if reconstruction.lines is None else len(reconstruction.lines)

@@ -36,6 +36,9 @@ Indices = NDArray[np.intp]
 #: A segment farther from its line than this, in standard deviations, is one of another line.
 _WRONG = 12.0
 
+#: Views whose segments any line fits.
+_FREE = 2
+
 #: Noise below this, in pixels, is rounding.
 _EXACT = 1e-4
 
@@ -105,9 +108,12 @@ def judged_lines(parts: LinesFound, table: Table, loss: Loss, finite: bool) -> V
     r = whitened(tracks.whitening, problem.linearizer.residuals(at.cameras, at.points))
     both = r, problem.kinds[0].residuals(at.cameras, at.others[0])
     of_points, of_lines = (job.scale_px * np.linalg.norm(part, axis=0) for part in both)
-    counts = np.concatenate([tracks.weights > 0.0, np.ones(len(parts.lines), np.bool_)])
+    # A line fits the segments of two views whatever they are: its residuals tell nothing.
+    told = np.bincount(parts.lines.line)[parts.lines.line] > _FREE
+    counts = np.concatenate([tracks.weights > 0.0, told])
     sizes = np.concatenate([np.sqrt(tracks.weights) * of_points, of_lines])[counts]
-    share = max(1.0 - diagnosis.rank / max(2 * len(sizes), 1), 1e-3)
+    rank = diagnosis.rank - 2 * int(np.count_nonzero(~told))
+    share = max(1.0 - rank / max(2 * len(sizes), 1), 1e-3)
     noise = median(sizes) / 1.1774 / float(np.sqrt(share))
     middles = 0.5 * (parts.lines.segments[:, :2] + parts.lines.segments[:, 2:])
     measured = np.concatenate([tracks.xy, middles])
