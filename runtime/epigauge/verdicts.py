@@ -171,6 +171,13 @@ FLAGS = {
         "--robust`)",
         ("F", "E", "H", "views"),
     ),
+    "poor fit": Flag(
+        "most observations are far from the images of their points, by more than a tenth of the "
+        "spread of the image coordinates, or some by a fiftieth and points behind their cameras: a "
+        "wrong minimum, or wrong matches",
+        "begin elsewhere, or look for wrong matches",
+        ("views",),
+    ),
     "outliers": Flag(
         "more residuals are beyond four standard deviations than noise explains: gross errors are "
         "left, which pull at the result",

@@ -30,7 +30,7 @@ def test_marquardt_does_not_call_a_bad_place_a_success(seed: int) -> None:
     best = eg.bundle_adjust(tracks).cost
     found = eg.bundle_adjust(tracks, start, method="marquardt", max_iter=500)
     assert found.cost > 1.4 * best  # or the start is no longer a bad one
-    if found.success:  # rounding led it to a minimum, if not the lowest: nothing leaves that
+    if found.status > 0:  # rounding led it to a minimum, if not the lowest: nothing leaves that
         again = eg.bundle_adjust(tracks, found.reconstruction)
         assert again.cost > (1.0 - 1e-3) * found.cost
         return
@@ -91,3 +91,43 @@ class TestLambdaFloor:
         assert self.apart(runs) < 1e-9
         lams = np.array([row.lam for row in runs[0].history[1:]])
         assert lams.min() == pytest.approx(dampings.LAM_FLOOR * lams[0], rel=1e-9)
+
+
+def arc(seed: int) -> tuple[eg.Tracks, eg.MetricReconstruction]:
+    """Return six calibrated views along an arc about sixty points, and the truth."""
+    random = np.random.default_rng(seed)
+    X = random.uniform(-1.0, 1.0, (60, 3))
+    angles = np.linspace(0.0, 0.4, 6)
+    R = np.zeros((6, 3, 3))
+    R[:, 0, 0] = R[:, 2, 2] = np.cos(angles)
+    R[:, 0, 2], R[:, 2, 0], R[:, 1, 1] = np.sin(angles), -np.sin(angles), 1.0
+    t = np.tile([0.0, 0.0, 4.0], (6, 1))
+    cameras = eg.Cameras("SIMPLE_PINHOLE", [[900.0, 640.0, 480.0]], [0] * 6)
+    truth = eg.MetricReconstruction(R, t, X, cameras)
+    view, point = np.nonzero(np.ones((6, 60)))
+    tracks = eg.Tracks(view, point, np.zeros((360, 2)))
+    xy = truth.project(tracks) + random.normal(0.0, 0.4, (360, 2))
+    return eg.Tracks(tracks.view, tracks.point, xy), truth
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_fit_that_misses_most_observations_is_no_success(seed: int) -> None:
+    tracks, truth = arc(seed)
+    assert eg.bundle_adjust(tracks, truth, refine="pose").success
+    xy, random = tracks.xy.copy(), np.random.default_rng(100 + seed)
+    for view in range(6):  # matches of other points: what is near is nowhere
+        own = np.flatnonzero(tracks.view == view)
+        xy[own] = xy[random.permutation(own)]
+    wrong = eg.Tracks(tracks.view, tracks.point, xy)
+    for start in (truth, truth.to_projective()):
+        found = eg.bundle_adjust(wrong, start, **({"refine": "pose"} if start is truth else {}))
+        assert "poor fit" in found.flags
+        assert not found.success
+
+
+@pytest.mark.parametrize("weight", [1e-6, 1e6])
+def test_a_fit_is_poor_in_pixels_whatever_the_weights(weight: float) -> None:
+    tracks, truth = arc(0)
+    heavy = eg.Tracks(tracks.view, tracks.point, tracks.xy, weights=np.full(len(tracks), weight))
+    for start in (truth, truth.to_projective()):
+        assert "poor fit" not in eg.bundle_adjust(heavy, start).flags

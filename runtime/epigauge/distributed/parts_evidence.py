@@ -134,6 +134,15 @@ class PartsEvidence:
         """Return the RMS of the coordinates of the residuals as they are, in pixels."""
         return float(np.sqrt(self.tail.facts[4] / (2 * self.count)))
 
+    def misses(self, limit: float) -> bool:
+        """Tell whether half of the observations are farther from their images."""
+        # Then their RMS, which is known already, is above half of the limit.
+        if not self.rms > 0.5 * limit:
+            return False
+        found = self._found
+        lengths = PartsTail(self._linearizer, found.vectors, found.X, weighted=False)
+        return lengths.median > limit
+
     @cached_property
     def of_views(self) -> Indices:
         """Return the number of observations of each view, (n,)."""

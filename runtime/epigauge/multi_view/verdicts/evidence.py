@@ -44,6 +44,13 @@ class Evidence(Protocol):
     def of_views(self) -> Indices:
         """Return the number of observations of each view that count, (n,)."""
 
+    @property
+    def rms(self) -> float:
+        """Return the RMS of the coordinates of the residuals as they are, in pixels."""
+
+    def misses(self, limit: float) -> bool:
+        """Tell whether half of the observations that count are farther from their images."""
+
     def open(self) -> tuple[str, ...]:
         """Return what the network lacks: names of flags."""
 
@@ -105,6 +112,24 @@ class EvidenceOfTracks:
         """Return the number of observations of each view that count, (n,)."""
         tracks = self.tracks
         return np.bincount(tracks.view[tracks.weights > 0.0], minlength=tracks.n_views)
+
+    def misses(self, limit: float) -> bool:
+        """Tell whether half of the observations that count are farther from their images."""
+        return bool(np.median(self._distances) > limit)
+
+    @property
+    def rms(self) -> float:
+        """Return the RMS of the coordinates of the residuals as they are, in pixels."""
+        with np.errstate(over="ignore"):
+            return float(np.sqrt(np.mean(self._distances**2) / 2.0))
+
+    @cached_property
+    def _distances(self) -> Array:
+        """Return the distances of the observations that count from their images, in pixels."""
+        counts = self.tracks.weights > 0.0
+        with np.errstate(invalid="ignore", over="ignore"):
+            distances = np.linalg.norm(self.tracks.xy - self.predicted, axis=1)
+        return np.asarray(distances[counts])
 
     def open(self) -> tuple[str, ...]:
         """Return what the network lacks: names of flags."""

@@ -18,7 +18,7 @@ from epigauge.multi_view.verdicts.gross import gross_flags
 from epigauge.multi_view.verdicts.perspective import affine_views
 from epigauge.multi_view.verdicts.relief import flatness
 from epigauge.multi_view.verdicts.shape import flat_scene, one_line
-from epigauge.multi_view.verdicts.verdict import Verdict
+from epigauge.multi_view.verdicts.verdict import FITS, Verdict, poor_fit
 from epigauge.multi_view.verdicts.words import largest, named, of_points, tangent_sizes
 from epigauge.verdicts import ordered
 
@@ -30,9 +30,6 @@ Mask = NDArray[np.bool_]
 #: Standard deviation of the depth and image of a camera's points, as a share of their size, above
 #: which the noise leaves a change of the cameras open.
 _WEAK = 0.3
-
-#: Noise, as a share of the RMS of the image coordinates, up to which a fit is one.
-_FITS = 0.05
 
 #: Numbers of a camera before its intrinsics; part of an open direction that these must have.
 _POSE, _PART = 6, 0.05
@@ -80,6 +77,9 @@ def judged_metric(
     system, rank = outcome.system, 0
     condition, weakest = float("inf"), ""
     tail, scale = evidence.tail, evidence.scale
+    rms, behind = evidence.rms if bends else 0.0, n_behind / max(evidence.count, 1)
+    if metric and poor_fit(evidence.misses, rms, scale, behind):
+        raised.add("poor fit")
     if not np.isfinite(tail.sum_of_squares):  # measured points that the cameras have no image of
         raised.add("gross errors")
     elif isinstance(system, BundleSystem) and np.isfinite(outcome.state.cost):
@@ -107,7 +107,7 @@ def judged_metric(
         elif flat > _WEAK or worst > _UNCERTAIN:
             raised.add("weak geometry")
         # Where the fit is bad, nothing is within its noise.
-        if isinstance(found, MetricReconstruction) and usual < _FITS * scale:
+        if isinstance(found, MetricReconstruction) and usual < FITS * scale:
             least, told = max(usual, 1e-9 * scale), worst > _UNCERTAIN
             shares = least * diagnosis.spread / sizes
             causes = _causes(evidence, found, system, diagnosis, least, shares, told, known)

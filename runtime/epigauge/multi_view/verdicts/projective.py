@@ -24,7 +24,7 @@ from epigauge.multi_view.verdicts.gross import TailOfArrays, gross_flags
 from epigauge.multi_view.verdicts.network import why_open
 from epigauge.multi_view.verdicts.perspective import affine_pairs
 from epigauge.multi_view.verdicts.rank import open_directions, suits
-from epigauge.multi_view.verdicts.verdict import Verdict
+from epigauge.multi_view.verdicts.verdict import FITS, Verdict, poor_fit
 from epigauge.multi_view.verdicts.words import of_views
 from epigauge.two_view.losses import robust_scale
 from epigauge.verdicts import ordered
@@ -38,9 +38,6 @@ Indices = NDArray[np.intp]
 #: Standard deviation of the depth and image of a camera's points, as a share of their size, above
 #: which the noise leaves a change of the cameras open.
 _WEAK = 0.3
-
-#: Noise, as a share of the RMS of the image coordinates, up to which a fit is one.
-_FITS = 0.05
 
 #: Share of single points that may be open without the rest being called undetermined.
 _OPEN = 0.05
@@ -114,7 +111,7 @@ def judged(
     information = max(weakest, 1e-300) * N / seen.n
     deviation = noise_px / frame.scale / float(np.sqrt(information))
     # Where the fit is bad, nothing is within its noise.
-    fits = noise_px < _FITS * frame.scale
+    fits = noise_px < FITS * frame.scale
     judge = fits and views < len(found.P)
     raised = set(parallax_flags(seen, noise_px)) if judge else set()
     images = h[:, :2] / h[:, 2:]
@@ -126,6 +123,11 @@ def judged(
         raised.update(("undetermined", *why_open(tracks, rejected)))
     elif of_points or deviation > _WEAK:
         raised.add("weak geometry")
+    middle = float(np.median(distances))
+    with np.errstate(over="ignore"):
+        rms = float(np.sqrt(np.mean(distances**2) / 2.0)) if bends else 0.0
+    if poor_fit(lambda limit: middle > limit, rms, frame.scale, n_behind / N):
+        raised.add("poor fit")
     if n_behind > BEHIND * N:
         raised.add("behind the cameras")
     condition = float("inf") if of_cameras or not weakest > 0.0 else 1.0 / weakest

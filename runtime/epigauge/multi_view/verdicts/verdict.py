@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
-__all__ = ["Verdict"]
+__all__ = ["FITS", "Verdict", "poor_fit"]
+
+#: Noise, as a share of the RMS of the image coordinates, up to which a fit is one.
+FITS = 0.05
+
+#: Median distance of the observations from their images, as a share of the same, above which a
+#: minimum is not that of the tracks: wrong ones have a fifth and more. Where some views only are
+#: wrong, more than such a share of the observations is behind its camera, and the RMS of the
+#: residuals is beyond so much.
+_MISSES, _BEHIND, _WRONG = 0.1, 0.05, 0.02
 
 
 @dataclass(frozen=True)
@@ -29,3 +39,20 @@ class Verdict:
     n_behind: int
     condition: float = float("inf")
     weakest: str = ""
+
+
+def poor_fit(misses: Callable[[float], bool], rms: float, scale: float, behind: float) -> bool:
+    """Tell whether a minimum cannot be that of the tracks.
+
+    Parameters
+    ----------
+    misses : callable
+        Tells whether half of the observations are farther from their images than a limit.
+    rms : float
+        RMS of the coordinates of the residuals; zero where gross errors have their part in it.
+    scale : float
+        RMS of the image coordinates about the centroids of the views.
+    behind : float
+        Share of the observations whose point is behind the camera.
+    """
+    return misses(_MISSES * scale) or (behind > _BEHIND and rms > _WRONG * scale)
