@@ -21,12 +21,12 @@ def turned(K: Array, w: tuple[float, float, float]) -> Array:
 def test_square_pixels_are_a_condition(focal: float, sign: float) -> None:
     near = 1e-11 * np.eye(9)  # covariance: a deviation of 3e-6
     K = np.array([[focal, 0.0, 0.3], [0.0, focal, -0.2], [0.0, 0.0, 1.0]])
-    assert is_of_a_turned_camera(sign * turned(K, (0.2, -0.1, 0.15)), sign**2 * near)
+    assert is_of_a_turned_camera(sign * turned(K, (0.2, -0.1, 0.15)), sign**2 * near, 100)
     K[0, 0] *= 1.3
-    assert not is_of_a_turned_camera(sign * turned(K, (0.2, -0.1, 0.15)), sign**2 * near)
+    assert not is_of_a_turned_camera(sign * turned(K, (0.2, -0.1, 0.15)), sign**2 * near, 100)
     K[0, 0] /= 1.3
     K[0, 2] = 30.0  # four images from the middle
-    assert not is_of_a_turned_camera(sign * turned(K, (0.2, -0.1, 0.15)), sign**2 * near)
+    assert not is_of_a_turned_camera(sign * turned(K, (0.2, -0.1, 0.15)), sign**2 * near, 100)
 
 
 @pytest.mark.parametrize("m", [20, 60])

@@ -25,9 +25,9 @@ from epigauge.two_view.planes import (
     displacement,
     is_plain_relief,
     judge_plane,
-    may_be_rotation,
     share_on_a_plane,
 )
+from epigauge.two_view.rotation import may_be_rotation
 from epigauge.two_view.suspicion import WIDE, agreeing, is_common, is_inflated, is_suspicious
 from epigauge.verdicts import ordered
 
@@ -123,9 +123,9 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
       most, RMS; at most a quarter where all are within half a per cent, RMS. Such a scene
       is planar where all are within a thousandth, RMS, but for those that agree by chance;
     - still camera: planar, and ``S_I - S_H <= max(20.1, 0.1 n) s^2``; in place of the former;
-    - pure rotation: planar, and ``|tr H - tr H^-1|`` (det H = 1) within three standard deviations
-      of zero: H = K R K^-1 has the eigenvalues of a rotation whatever K. Of calibrated cameras,
-      planar, and the same bound holds for ``S_R / (2 n - 3)``, the rotation's;
+    - pure rotation: planar, and H = K R K^-1 within three standard deviations, with square pixels
+      and a focal length and principal point that cameras have. Of calibrated cameras, planar, and
+      the same bound holds for ``S_R / (2 n - 3)``, the rotation's;
     - not oriented; of calibrated cameras behind the cameras: some points farther from being in
       front of both than three standard deviations;
     - near-affine: ``S_A - S <= 11.34 s^2``;
@@ -233,7 +233,10 @@ def _plane(found: Evidence) -> dict[str, bool]:
     q1, q2 = found.q1[:, on], found.q2[:, on]
     more = displacement(found, q1, q2, weights) - model.cost
     if found.from_rays is None:
-        turned = may_be_rotation(found, model.H, model.normal)
+        maps, redundancy = (found.to_units1, found.to_units2), len(weights) - found.parameters
+        turned = explained and may_be_rotation(
+            *maps, model.H, model.normal, noise2**0.5, redundancy
+        )
     else:
         squared = Calibrated(q1, q2, *found.from_rays).from_rotation(weights)
         with np.errstate(invalid="ignore"):  # a match that no rotation maps: none is claimed

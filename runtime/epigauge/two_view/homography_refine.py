@@ -35,8 +35,7 @@ from epigauge.two_view.homography import fit_homography, plane_squares, robust_h
 from epigauge.two_view.homography_problem import PARAMETERS, HomographyProblem, Transfer, across
 from epigauge.two_view.homography_result import HomographyResult
 from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, median
-from epigauge.two_view.planes import rotation_within
-from epigauge.two_view.rotation import is_of_a_turned_camera
+from epigauge.two_view.rotation import may_be_rotation
 from epigauge.two_view.solve import joined
 from epigauge.two_view.suspicion import TAIL, TAIL_SHARE, WIDE
 from epigauge.verdicts import ordered, usable
@@ -288,14 +287,7 @@ def _assembled(
         covariance = np.diag(np.full(9, np.inf))
     deviation = math.sqrt(known**2 / values[0]) if rank == PARAMETERS else math.inf
     gradient = problem.linearize(state).gradient * scale**2
-    flags = _flags(problem, state, to1, to2, known, deviation, N)
-    if "pure rotation" in flags and np.isfinite(covariance).all():
-        # Both images in the coordinates of the first, as one camera has them
-        entries = np.kron(to1, np.linalg.inv(to1).T)
-        H = (entries @ unit).reshape(3, 3)
-        own = known**2 * factor / max(variance, np.finfo(float).tiny) * covariance
-        if not is_of_a_turned_camera(H, entries @ own @ entries.T):
-            flags = tuple(flag for flag in flags if flag != "pure rotation")
+    flags = _flags(problem, state, (to1, to2), known, math.sqrt(factor), deviation, N)
     finite = np.isfinite(squared)
     return HomographyResult(
         H=pixels / size,
@@ -330,13 +322,17 @@ def _assembled(
 def _flags(
     problem: HomographyProblem,
     state: Transfer,
-    to1: Array,
-    to2: Array,
+    maps: tuple[Array, Array],
     noise: float,
+    wider: float,
     deviation: float,
     N: Array,
 ) -> tuple[str, ...]:
-    """Return what can be the matter with a homography of matches that are said to be right."""
+    """Return what can be the matter with a homography of matches that are said to be right.
+
+    With a robust loss, H is so many times wider spread than the noise says.
+    """
+    to1, to2 = maps
     counts = problem.weights > 0.0
     q1, q2 = (np.ascontiguousarray(q[:, counts]) for q in (problem.q1, problem.q2))
     weights = problem.weights[counts]
@@ -368,7 +364,8 @@ def _flags(
     told["still camera"] = more <= still_bound(n, 2 * n - PARAMETERS) * noise2
     if not told["still camera"]:
         B = across(state.H)
-        told["pure rotation"] = rotation_within(to1, to2, noise, state.H, B @ N @ B.T)
+        spread, N = wider * max(noise, ROUNDING), B @ N @ B.T
+        told["pure rotation"] = may_be_rotation(*maps, state.H, N, spread, 2 * n - PARAMETERS)
     return ordered(name for name, raised in told.items() if raised)
 
 
