@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 from epigauge.kernels import Table
 from epigauge.two_view.parameterizations import OrthonormalF
 
-__all__ = ["Calibrated", "Essential", "Motion", "in_front", "motion_from_essential", "motions"]
+__all__ = [
+    "Calibrated",
+    "Essential",
+    "Motion",
+    "in_front",
+    "motion_from_essential",
+    "motions",
+    "rotation_between",
+]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -222,8 +230,7 @@ class Calibrated:
         units1, units2 = (
             r / np.linalg.norm(r, axis=1)[:, None] for r in self.rays(self.q1, self.q2)
         )
-        U, _, Vt = np.linalg.svd((units2 * weights[:, None]).T @ units1)
-        return self.from_infinity(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+        return self.from_infinity(rotation_between(units1, units2, weights))
 
 
 def motions(E: Array) -> tuple[Array, Array]:
@@ -273,3 +280,9 @@ def motion_from_essential(E: Array, rays1: Array, rays2: Array) -> tuple[Array, 
     R, t = motions(E)
     best = int(np.argmax(np.count_nonzero(in_front(R, t, rays1, rays2), axis=1)))
     return R[best], t[best]
+
+
+def rotation_between(rays1: Array, rays2: Array, weights: Array | float = 1.0) -> Array:
+    """Return the R of least squares of rays2 = R rays1, directions (m, 3) of unit length."""
+    U, _, Vt = np.linalg.svd((rays2 * np.reshape(weights, (-1, 1))).T @ rays1)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)

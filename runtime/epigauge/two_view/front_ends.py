@@ -42,6 +42,9 @@ _SHARP = 0.5
 #: Among fewer matches, some agree so sharply by chance; each search is then made twice.
 _MANY = 400
 
+#: Among so few, four times: which right ones are sampled is a matter of luck.
+_FEW = 64
+
 #: Then wrong matches are looked at within so many scales, for how dense they are there.
 _EXTENT = 20.0
 
@@ -57,9 +60,6 @@ _NEAR, _ASTRAY, _REPEATED, _PLAIN = 2.0, 0.3, 0.2, 0.55
 #: That is better where matches move with their neighbours by so much more in all, and those that
 #: only it explains by so much more each than those that only the other does.
 _GAIN, _BETTER = 1.05, 1.2
-
-#: Right matches that are more than those which fit by chance.
-_ENOUGH = 14
 
 #: Standard deviation of the noise that the 8-point estimate is judged with.
 _BLIND = 0.07
@@ -137,7 +137,7 @@ def _native(
     q1, q2 = (np.ascontiguousarray(h[:2, few]) for h in (consensus.h1, consensus.h2))
     order = ranked(kernels, q1, q2) if score is None else np.argsort(-score[few], kind="stable")
     agreements: list[Agreement] = []
-    turns = 1 if q1.shape[1] >= _MANY else 2
+    turns = 1 if q1.shape[1] >= _MANY else 2 if q1.shape[1] >= _FEW else 4
     for scale, turn in itertools.product(SCALES, range(turns)):
         found = search(kernels, q1, q2, order, seed=seed + turn, scale=scale)
         if not found.score > 0.0:
@@ -156,9 +156,7 @@ def _native(
         agreements.append(consensus.judge(found.F, scale))
     if not agreements:
         return None
-    # A few matches fit exactly by chance: of so many samples, and in any of them seven do.
-    enough = [a for a in agreements if a.share * len(a.signed) >= _ENOUGH] or agreements[-1:]
-    return consensus.search(enough, rng)
+    return consensus.search(agreements, rng)
 
 
 def _is_sharp(

@@ -26,6 +26,7 @@ from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.copies import earliest
 from epigauge.two_view.evidence import ROUNDING
 from epigauge.two_view.homography import fit_homography, plane_squares
+from epigauge.two_view.homography_problem import PARAMETERS
 from epigauge.two_view.homography_refine import (
     DEVIATIONS,
     LEAST,
@@ -57,6 +58,10 @@ _WIDTHS, _FLOOR = (8.0, 3.0, 1.5), 0.01
 #: What is left of the variance within `DEVIATIONS`, which 99.9 % of right matches are within.
 _KEPT = 1.0 - math.log(1000.0) / 999.0
 
+#: Of fewer matches a sharp score sees no more than the samples that fit best by chance: they are
+#: judged by their likelihood, with the eight parameters counted. Least deviation, conditioned.
+_FEW, _SHARPEST = 64, 1e-9
+
 #: Steps of the maximisation of the likelihood, and rounds of inliers at most.
 _STEPS, _ROUNDS = 30, 10
 
@@ -87,20 +92,20 @@ class PlaneMixture:
         return self.sigma * math.sqrt(max(2.0 * math.log(max(odds, 1e-300)), 0.0))
 
     @staticmethod
-    def of(squared: Array, sigma: float, steps: int = _STEPS) -> PlaneMixture:
+    def of(squared: Array, sigma: float, *, parameters: int = PARAMETERS) -> PlaneMixture:
         """Return the mixture of highest likelihood, by expectation and maximisation."""
         share, m = 0.5, len(squared)
         widest = CEILING * RANGE / 3.0
         squared = np.minimum(squared, RANGE**2)
-        for step in range(steps + 1):
+        for step in range(_STEPS + 1):
             right = share / (2.0 * math.pi * sigma**2) * np.exp(-0.5 * squared / sigma**2)
             total = right + (1.0 - share) / RANGE**2
-            if step == steps:
+            if step == _STEPS:
                 break
             p = right / total
             weight = max(float(np.sum(p)), 1e-12)
-            # Four matches fit exactly: they say nothing of the noise
-            free = max(2.0 * weight - 8.0, 1.0)
+            # Parameters absorb squares: four matches fit exactly and say nothing of the noise
+            free = max(2.0 * weight - parameters, 1.0)
             sigma = min(max(math.sqrt(float(p @ squared) / free), 1e-12), widest)
             share = min(max(weight / m, 1e-3), 0.999)
         return PlaneMixture(sigma, share, float(np.sum(np.log(total))))
@@ -225,10 +230,32 @@ def estimate_homography(
     return with_flags(result, flags)
 
 
-def _agreement(squared: Array) -> float:
-    """Return the score of a homography: as that of F, a mixture of all noises."""
+def _agreements(squared: Array) -> Array:
+    """Return the scores of homographies by squared distances (k, m).
+
+    As that of F, a mixture of all noises; of few matches, the likelihood.
+    """
+    if squared.shape[1] <= _FEW:
+        return _likelihoods(squared)
     scale2 = SCALES[0] ** 2
-    return float(np.sum(np.log1p(scale2 / (squared + _FLOOR * scale2))))
+    return np.asarray(np.sum(np.log1p(scale2 / (squared + _FLOOR * scale2)), axis=1))
+
+
+def _likelihoods(squared: Array) -> Array:
+    """Return logarithms of likelihoods of squared distances (k, m), less what four matches gain.
+
+    The best number of right matches is taken: n of them, nearest first, have the variance
+    sum / (2 n - 8), and their share is n / m.
+    """
+    m = squared.shape[1]
+    n = np.arange(LEAST + 1, m + 1)
+    with np.errstate(over="ignore"):
+        sums = np.cumsum(np.sort(np.minimum(squared, RANGE**2), axis=1), axis=1)[:, LEAST:]
+    free = 2.0 * (n - LEAST)
+    sigma = np.maximum(np.sqrt(sums / free), _SHARPEST)
+    mixing = n * np.log(n / m) + (m - n) * np.log(np.maximum(m - n, 1) / m)
+    logs = free * np.log(RANGE / sigma) - n * math.log(2.0 * math.pi) - 0.5 * free + mixing
+    return np.asarray(np.max(logs, axis=1, initial=-np.inf))
 
 
 def _searched(
@@ -254,12 +281,12 @@ def _searched(
         done += _BATCH
         if not len(candidates):
             continue
-        first = np.array([_agreement(plane_squares(table, one, j1, j2)) for one in candidates])
+        first = _agreements(np.array([plane_squares(table, one, j1, j2) for one in candidates]))
         finalists = candidates[np.argsort(-first, kind="stable")[:_FINALISTS]]
-        scores = [_agreement(plane_squares(table, one, q1, q2)) for one in finalists]
-        if max(scores) <= highest:
+        scores = _agreements(np.array([plane_squares(table, one, q1, q2) for one in finalists]))
+        if np.max(scores) <= highest:
             continue
-        highest = max(scores)
+        highest = float(np.max(scores))
         best, fitted = _improved(table, finalists[int(np.argmax(scores))], q1, q2, best)
         near = np.count_nonzero(plane_squares(table, best, q1, q2) <= (3.0 * SCALES[0]) ** 2)
         needed = min(max(_PATIENCE * (m / max(near, 4.0)) ** 4, _LEAST), _MOST)
@@ -276,5 +303,5 @@ def _improved(table: Table, H: Array, q1: Array, q2: Array, before: Array) -> tu
             break
         H = fit_homography(q1, q2, weights, table)[0]
         found.append(H)
-    scores = [_agreement(plane_squares(table, one, q1, q2)) for one in found]
-    return np.asarray(found[int(np.argmax(scores))]), max(scores)
+    scores = _agreements(np.array([plane_squares(table, one, q1, q2) for one in found]))
+    return np.asarray(found[int(np.argmax(scores))]), float(np.max(scores))

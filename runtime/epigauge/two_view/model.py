@@ -24,6 +24,7 @@ from epigauge.errors import ArgumentError
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.consensus import RANGE, Consensus
 from epigauge.two_view.copies import earliest
+from epigauge.two_view.essential import rotation_between
 from epigauge.two_view.homography import plane_squares
 from epigauge.two_view.homography_result import HomographyResult
 from epigauge.two_view.homography_search import PlaneMixture, estimate_homography
@@ -49,6 +50,12 @@ _MODELS: dict[str, Model] = {
 #: Parameters of each model; noise and share of right matches are two more of all but the first.
 _PARAMETERS = {"nothing": 0, "still": 0, "rotation": 3, "plane": 8, "F": 7, "E": 5}
 
+#: What a plane in F or E takes more.
+_PLANE_IN_IT = 3
+
+#: Steps of the maximisation of a likelihood; and the constant of the normal density.
+_STEPS, _ROOT = 30, math.sqrt(2.0 * math.pi)
+
 #: The noise of a homography over that of F beyond which there is relief.
 _WIDER = 1.5
 
@@ -69,9 +76,11 @@ class TwoViewResult(Result):
     R, t : ndarray, shape (3, 3) and (3,), or None
         With calibration, the motion ``x2 = R x1 + t``, t of unit length; of a rotation R alone.
     evidence : dict
-        For each model that was compared ``log_likelihood``, ``parameters`` and ``score``, the
-        former less ``log(m) / 2`` for each parameter; the likelihood is relative to that of wrong
-        matches alone, which is "nothing" with zero.
+        For each model that was compared ``log_likelihood``, ``parameters`` and ``score``; the
+        likelihood is relative to that of wrong matches alone, which is "nothing" with zero. The
+        score is less by what matches gain that are fitted exactly, ``log(range / sigma)`` for each
+        parameter of the geometry, range being that of the coordinates, and by ``log(m) / 2`` for
+        each noise and share: so wrong matches that fit by chance hardly count.
     inliers : ndarray of bool, shape (m,)
         Which matches agree with the model, duplicates included.
     flags : tuple of str
@@ -173,8 +182,8 @@ def estimate_two_view(
     -----
     A right match has normal noise across its epipolar line and may be anywhere along it; of a
     homography it has normal noise in both directions; a wrong one may be anywhere. That F also
-    explains a plane is counted: matches on the homography have the density of the plane under F,
-    too, and F is better by those off it only.
+    explains a plane is counted: under F matches have a relief along their epipolar lines, off the
+    plane, the deviation of which is fitted; it is no more than the noise where all are on it.
 
     Examples
     --------
@@ -263,8 +272,11 @@ def _model(
     if "rotation" not in evidence:  # without calibration H knows best whether it is a camera's
         flags -= {"pure rotation"} - {*plane.flags}
     # H may be that of a rotation with some calibration, but not with this one
-    if "rotation" in evidence and evidence["rotation"]["score"] < evidence["plane"]["score"]:
-        flags -= {"pure rotation"} - {*general.flags}
+    if "rotation" in evidence:
+        turned, free = (evidence[model] for model in ("rotation", "plane"))
+        fewer = 0.5 * (free["parameters"] - turned["parameters"]) * math.log(len(plane.inlier))
+        if turned["log_likelihood"] + fewer < free["log_likelihood"]:
+            flags -= {"pure rotation"} - {*general.flags}
     return next(model for flag, model in _MODELS.items() if flag in flags)
 
 
@@ -284,57 +296,77 @@ def _evidence(
     table, (q1, q2) = kernels.table(backend), frame.forward(y1, y2)
     m = len(rows)
     wrong = -2.0 * m * math.log(RANGE)
-    found: dict[str, dict[str, float]] = {}
+    found = {"nothing": {"log_likelihood": 0.0, "parameters": 0.0, "score": 0.0}}
 
-    def add(model: str, logarithm: float) -> None:
-        parameters = _PARAMETERS[model] + (0 if model == "nothing" else 2)
+    def add(model: str, logarithm: float, sigma: float, plane_in_it: bool = False) -> None:
+        parameters = _PARAMETERS[model] + plane_in_it * _PLANE_IN_IT
+        others = 2 + 2 * plane_in_it  # noise and share; of the plane, relief and share
+        exact = parameters * math.log(RANGE / sigma)
         gain = logarithm - wrong
-        score = gain - 0.5 * parameters * math.log(m)
-        found[model] = {"log_likelihood": gain, "parameters": parameters, "score": score}
+        score = gain - exact - 0.5 * others * math.log(m)
+        if score > found.get(model, {}).get("score", -math.inf):
+            entry = {"log_likelihood": gain, "parameters": float(parameters + others)}
+            found[model] = entry | {"score": score}
 
-    def squares(H: Array) -> Array:
-        return plane_squares(table, frame.homography_from_pixels(H), q1, q2)
+    def add_plane(model: str, H: Array) -> tuple[PlaneMixture, Array]:
+        squares = plane_squares(table, frame.homography_from_pixels(H), q1, q2)
+        mixture = PlaneMixture.of(squares, SCALES[0], parameters=_PARAMETERS[model])
+        add(model, mixture.logarithm, mixture.sigma)
+        return mixture, squares
 
-    add("nothing", wrong)
-    add("still", PlaneMixture.of(squares(np.eye(3)), SCALES[0]).logarithm)
-    R, squared, widest = None, np.full(m, np.inf), 0.0
+    add_plane("still", np.eye(3))
+    R, squared, widest, simpler = None, np.full(m, np.inf), 0.0, -math.inf
     if plane is not None:
-        squared = squares(plane.H)
-        mixture = PlaneMixture.of(squared, SCALES[0])
-        add("plane", mixture.logarithm)
-        widest = mixture.sigma
+        mixture, squared = add_plane("plane", plane.H)
+        widest, simpler = mixture.sigma, mixture.logarithm - wrong
         if calibration is not None:
             K1, K2 = calibration
-            M = np.linalg.inv(K2) @ plane.H @ K1
-            U, _, Vt = np.linalg.svd(M * np.sign(np.linalg.det(M)))
-            R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-            turned = PlaneMixture.of(squares(K2 @ R @ np.linalg.inv(K1)), SCALES[0])
-            add("rotation", turned.logarithm)
+            R = rotation_between(*(_rays(x[plane.inlier], K) for x, K in ((x1, K1), (x2, K2))))
+            add_plane("rotation", K2 @ R @ np.linalg.inv(K1))
     agreed = Consensus(table, q1, q2).judge(frame.from_pixels(general.F), SCALES[0])
     # Of the same noise; a plane that needs more of it has relief
     sigma = max(agreed.sigma, min(widest, _WIDER * agreed.sigma))
-    variance = sigma**2
-    on = -0.5 * np.minimum(squared / variance, 1e6) - math.log(2.0 * math.pi * variance)
-    add(name, _general(agreed.signed, agreed.oriented, sigma, on))
+    with_plane = _general(agreed.signed, agreed.oriented, sigma, squared)
+    add(name, _general(agreed.signed, agreed.oriented, sigma), sigma)
+    add(name, with_plane, sigma, plane_in_it=True)
     # The epipole can be put on the lines of any two of the matches off the plane
     chosen = 0.5 * 5.0 * math.log(m) + 2.0 * math.log(m)
-    flat = (
-        "plane" in found
-        and widest <= _WIDER * agreed.sigma
-        and found[name]["log_likelihood"] - chosen <= found["plane"]["log_likelihood"]
-    )
+    flat = widest <= _WIDER * agreed.sigma and with_plane - wrong - chosen <= simpler
     return found, R, flat
 
 
-def _general(signed: Array, oriented: Mask, sigma: float, on: Array) -> float:
-    """Return the logarithm of the likelihood of F, with a plane in it, shares being fitted."""
-    squared = np.minimum((signed / sigma) ** 2, 1e6)
-    off = -0.5 * squared - math.log(math.sqrt(2.0 * math.pi) * sigma * RANGE)
-    logs = np.stack([on, np.where(oriented, off, -np.inf), np.full(len(on), -2 * math.log(RANGE))])
-    highest = np.max(logs, axis=0)
-    densities = np.exp(logs - highest)
-    shares = np.array([0.3, 0.4, 0.3])
-    for _ in range(30):
-        parts = shares[:, None] * densities
-        shares = np.mean(parts / np.sum(parts, axis=0), axis=1)
-    return float(np.sum(highest + np.log(shares @ densities)))
+def _rays(x: Array, K: Array) -> Array:
+    """Return points as directions of unit length."""
+    rays = np.column_stack([x, np.ones(len(x))]) @ np.linalg.inv(K).T
+    return np.asarray(rays / np.linalg.norm(rays, axis=1)[:, None])
+
+
+def _general(signed: Array, oriented: Mask, sigma: float, from_plane: Array | None = None) -> float:
+    """Return the logarithm of the likelihood of F, shares being fitted.
+
+    By squared distances from a plane, some matches are off it by a relief along their epipolar
+    lines, normal with a deviation that is fitted, too; others are anywhere on their lines.
+    """
+    m = len(signed)
+    squared = np.minimum(signed**2, 1e6 * sigma**2)
+    across = np.where(oriented, -0.5 * squared / sigma**2 - math.log(_ROOT * sigma), -np.inf)
+    logs = np.full((3, m), -2.0 * math.log(RANGE))
+    logs[1] = across - math.log(RANGE)
+    shares, relief = np.array([0.3, 0.4, 0.3]), sigma
+    along = np.full(m, np.inf) if from_plane is None else np.maximum(from_plane - squared, 0.0)
+    if from_plane is None:
+        shares[2] = 0.0
+    for step in range(_STEPS + 1):
+        with np.errstate(over="ignore"):
+            logs[2] = across - 0.5 * np.minimum(along / relief**2, 1e6) - math.log(_ROOT * relief)
+        highest = np.max(logs, axis=0)
+        parts = shares[:, None] * np.exp(logs - highest)
+        total = np.sum(parts, axis=0)
+        if step == _STEPS:
+            break
+        shares = np.mean(parts / total, axis=1)
+        on = parts[2] / total
+        if np.sum(on) > 0.0:
+            away = float(on @ np.where(on > 0.0, along, 0.0)) / float(np.sum(on))
+            relief = min(max(math.sqrt(away), sigma), RANGE)
+    return float(np.sum(highest + np.log(total)))

@@ -7,14 +7,15 @@ by three numbers a plane, without a fit; only where that share is large, homogra
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.two_view.chance import chance_agreement
+from epigauge.two_view.chance import chance_agreement, log10_false_alarms
 from epigauge.two_view.consensus import RANGE
-from epigauge.two_view.evidence import ROUNDING, WITHIN, Evidence
+from epigauge.two_view.evidence import ROUNDING, Evidence
 from epigauge.two_view.homography import fit_homography, robust_homography
 
 __all__ = [
@@ -37,8 +38,6 @@ __all__ = [
     "displacement",
     "is_plain_relief",
     "judge_plane",
-    "may_be_rotation",
-    "rotation_within",
     "share_on_a_plane",
     "threes",
 ]
@@ -278,8 +277,9 @@ def _is_accidental(found: Evidence, apart: Array, off: Mask) -> bool:
     The line from where the homography takes a match to the match itself is an epipolar line. That
     of a wrong match which is d off has any direction, and is within a distance l of one with the
     probability 2 / pi asin(l / d). Matches side by side in both images count as one: features have
-    several scales and orientations, and all of one place fix one line. Wrong matches are anywhere;
-    where more than a few are only slightly off, that is relief.
+    several scales and orientations, and all of one place fix one line. Wrong matches are anywhere:
+    where more than a few are only slightly off, or more lie within a distance of the plane than
+    chance explains, that is relief.
     """
     agree = np.flatnonzero(off & found.inlier)
     slight = np.count_nonzero(apart[agree] <= (_SLIGHTLY * found.limit) ** 2)
@@ -290,7 +290,21 @@ def _is_accidental(found: Evidence, apart: Array, off: Mask) -> bool:
     with np.errstate(invalid="ignore"):  # infinitely far
         sine = found.limit / np.sqrt(apart[wrong])
     chances = 2.0 / np.pi * np.arcsin(np.minimum(sine, 1.0))
-    return chance_pairs(chances, len(agree)) > _BY_CHANCE
+    if chance_pairs(chances, len(agree)) <= _BY_CHANCE:
+        return False
+    return not _is_beside(np.sqrt(np.sort(apart[agree])), len(wrong), found.limit)
+
+
+def _is_beside(distances: Array, n: int, limit: float) -> bool:
+    """Tell whether more of n wrong matches agree within a distance of a plane than by chance.
+
+    Those within d of where the homography takes them, and within l of an epipolar line through
+    there, are in a part 4 l d of the range of the coordinates, squared.
+    """
+    part = np.minimum(np.pi * distances, 4.0 * limit) * distances / RANGE**2
+    bar = math.log10(_BY_CHANCE / max(len(distances), 1))
+    alarms = (log10_false_alarms(n, k, p, _EPIPOLE) for k, p in enumerate(part.tolist(), 1))
+    return any(own <= bar for own in alarms)
 
 
 def _one_of_each(q1: Array, q2: Array) -> Mask:
@@ -328,34 +342,6 @@ def chance_pairs(chances: Array, k: int) -> float:
         fewer[1:] += chance * (fewer[:-1] - fewer[1:])
         fewer[0] *= 1.0 - chance
     return 0.5 * n * (n - 1) * max(1.0 - float(np.sum(fewer)), 0.0)
-
-
-def may_be_rotation(found: Evidence, H: Array, N: Array) -> bool:
-    """Tell whether H has the eigenvalues of a rotation, 1 and exp(+-i a), within the noise.
-
-    Then tr H = tr H^-1 at det H = 1. Both images must have the same coordinates for that: H is
-    mapped from the units of the second image to those of the first.
-    """
-    return rotation_within(found.to_units1, found.to_units2, found.noise, H, N)
-
-
-def rotation_within(to_units1: Array, to_units2: Array, noise: float, H: Array, N: Array) -> bool:
-    """Tell the same of a homography of any matches, of which `noise` is the deviation."""
-    same = to_units1 @ np.linalg.inv(to_units2)
-    G = same @ H
-    determinant = float(np.linalg.det(G))
-    if determinant == 0.0:
-        return False
-    root = np.cbrt(determinant)
-    inverse = np.linalg.inv(G)
-    trace, trace_inverse = np.trace(G) / root, np.trace(inverse) * root
-    by_log_determinant = -(trace + trace_inverse) / 3.0 * inverse.T
-    by_G = np.eye(3) / root + root * (inverse @ inverse).T + by_log_determinant
-    by_H = (same.T @ by_G).ravel()
-    values, vectors = np.linalg.eigh(N)
-    values = np.maximum(values, np.finfo(float).eps * values[-1])
-    variance = max(noise, ROUNDING) ** 2 * np.sum((vectors[:, 1:].T @ by_H) ** 2 / values[1:])
-    return bool(abs(trace - trace_inverse) <= WITHIN * np.sqrt(variance))
 
 
 def affine_cost(q1: Array, q2: Array, weights: Array) -> float:
