@@ -200,13 +200,13 @@ class Consensus:
         for _ in range(_CLIMBS):
             squared = np.where(best.oriented, best.signed, 0.0) ** 2
             right = np.where(best.oriented, best.mixture(squared)[1], 0.0)
-            trial = self.judge(self._fitted(best.F, right), best.sigma, best.share)
+            trial = self.judge(self.fitted(best.F, right), best.sigma, best.share, best.extent)
             if not trial.score > best.score + _CLIMBED:
                 break
             best = trial
         return best
 
-    def _fitted(self, F: Array, weights: Array) -> Array:
+    def fitted(self, F: Array, weights: Array) -> Array:
         """Return the geometry of least squares near one."""
         start, criterion = self.chart.start(F), self.criterion
         if criterion.kernels.compiled:

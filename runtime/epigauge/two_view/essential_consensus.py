@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
-from epigauge.two_view.consensus import Agreement, Consensus
+from epigauge.two_view.consensus import RANGE, Agreement, Consensus
 from epigauge.two_view.essential import Calibrated, Essential
 from epigauge.two_view.five_point import essential_starts
 from epigauge.two_view.parameterizations import Remapped
@@ -23,6 +23,9 @@ Array = NDArray[np.float64]
 #: among the matches that agree.
 _POOLS, _EACH, _CLIMBERS = 2, 5, 2
 _ROUNDS = 3
+
+#: An E whose noise is so many times that of F is not sharp: its K may be wrong.
+_BLUNTER = 2.0
 
 #: An improvement of the likelihood that is worth another round.
 _CLIMBED = 1e-3
@@ -61,7 +64,18 @@ class EssentialConsensus(Consensus):
         return self.judge(found[0], _BLIND)
 
     def search(self, starts: Iterable[Agreement], rng: np.random.Generator) -> Agreement:
-        """Climb from what five of the matches that agree with a start lead to."""
+        """Climb from what five of the matches that agree with a start lead to.
+
+        Where F agrees sharply, E is judged by the matches near it, too, if it agrees as sharply.
+        """
+        starts = list(starts)
+        best = self._searched(starts)
+        sharpest = min(start.sigma for start in starts)
+        if best.extent < RANGE and best.sigma > _BLUNTER * sharpest:
+            best = self._searched([self.judge(a.F, a.sigma, a.share) for a in starts])
+        return best
+
+    def _searched(self, starts: list[Agreement]) -> Agreement:
         ranked = sorted(starts, key=lambda start: -start.score)[:_POOLS]
         pools = [(start, start.inliers(3.0 * start.sigma)) for start in ranked]
         pools.append((ranked[0], np.ones(self.cameras.q1.shape[1], dtype=np.bool_)))
