@@ -215,6 +215,14 @@ FLAGS = {
         "the coordinates spread over less than 2: not pixels?",
         "give coordinates in pixels; lengths and thresholds are in the unit of the coordinates",
     ),
+    "wrong calibration": Flag(
+        "a fundamental matrix explains the matches much better than an essential one: the "
+        "calibration does not fit, or the lenses are distorted, and the motion is off by more than "
+        "its standard deviations say",
+        "check K1 and K2 (focal length, principal point, scale of the images), undistort the "
+        "points, or estimate F",
+        ("E",),
+    ),
     "distorted cameras": Flag(
         "lens distortion bends the points by more than their noise, which no F can follow",
         "undistort the points first",

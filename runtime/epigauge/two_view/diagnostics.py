@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.two_view.calibration import is_calibration_wrong
 from epigauge.two_view.chance import SIGNIFICANT, log10_false_alarms
 from epigauge.two_view.collinear import is_left_open
 from epigauge.two_view.consensus import RANGE
@@ -128,6 +129,9 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
       the same bound holds for ``S_R / (2 n - 3)``, the rotation's;
     - not oriented; of calibrated cameras behind the cameras: some points farther from being in
       front of both than three standard deviations;
+    - wrong calibration: of calibrated cameras, a free F leaves a sum of squares that is less by
+      more than its two parameters take by chance (1 in 10^5), and less than two thirds of the
+      variance; or it agrees with a quarter more raw matches. A plane agrees with any calibration;
     - near-affine: ``S_A - S <= 11.34 s^2``;
     - weak geometry: ``deviation > 0.1``, or a homography explains the matches and the noise hides
       relief; few matches: ``n - p < 8``.
@@ -166,6 +170,7 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
         raised["no common geometry"] = True
     else:
         raised["undetermined"] = is_left_open(judged)
+        raised["wrong calibration"] = found.from_rays is not None and is_calibration_wrong(judged)
         for name, is_raised in _plane(judged).items():
             raised[name] = is_raised or raised.get(name, False)
     return ordered(name for name, is_raised in raised.items() if is_raised)

@@ -87,6 +87,9 @@ BESIDE = 0.01
 _SLIGHTLY = 5.0
 _FEW_SLIGHT = 0.1
 
+#: Matches off a plane by no more than so many times the distance of an inlier may be its noise.
+_TAILS = 2.0
+
 
 #: So many places off any plane are plainly relief, if they are so many times what chance explains.
 PLENTY, PLAINLY = 40, 8.0
@@ -299,9 +302,11 @@ def _is_beside(distances: Array, n: int, limit: float) -> bool:
     """Tell whether more of n wrong matches agree within a distance of a plane than by chance.
 
     Those within d of where the homography takes them, and within l of an epipolar line through
-    there, are in a part 4 l d of the range of the coordinates, squared.
+    there, are in a part 4 l d of the range of the coordinates, squared. Those hardly beyond l are
+    left out: noise has heavy tails.
     """
-    part = np.minimum(np.pi * distances, 4.0 * limit) * distances / RANGE**2
+    distances = distances[distances > _TAILS * limit]
+    part = np.minimum(4.0 * limit * distances / RANGE**2, 1.0)
     bar = math.log10(_BY_CHANCE / max(len(distances), 1))
     alarms = (log10_false_alarms(n, k, p, _EPIPOLE) for k, p in enumerate(part.tolist(), 1))
     return any(own <= bar for own in alarms)
