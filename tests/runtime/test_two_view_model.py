@@ -117,3 +117,37 @@ def test_one_calibration_alone_is_refused() -> None:
         eg.estimate_two_view(x1, x2, None, K)
     with pytest.raises(eg.ArgumentError, match="K1"):
         eg.estimate_essential(x1, x2, None)  # type: ignore[arg-type]
+
+
+def test_few_matches_tell_their_model() -> None:
+    # Fourteen right ones of twenty, of which any seven fit exactly
+    for seed in range(3):
+        for kind in ("rotation", "plane", "F"):
+            x1, x2, _ = scene(kind, 20, 0.3, 20 + seed)
+            result = eg.estimate_two_view(x1, x2)
+            assert result.model == kind
+            assert np.count_nonzero(result.inliers[6:]) >= 12
+
+
+def test_a_few_sharp_matches_do_not_hide_a_still_camera() -> None:
+    x1, x2, _ = scene("still", 20, 0.6, 31)
+    assert eg.estimate_two_view(x1, x2).model == "still"
+
+
+@pytest.mark.parametrize(("factor", "told"), [(1.0, False), (1.002, False), (1.3, True)])
+def test_a_calibration_that_does_not_fit_is_told(factor: float, told: bool) -> None:
+    x1, x2, _ = scene("F", 200, 0.2, 12)
+    given = K * [[factor, 1.0, 1.0], [1.0, factor, 1.0], [1.0, 1.0, 1.0]]
+    for result in (
+        eg.estimate_essential(x1, x2, given),
+        eg.refine_fundamental(x1[40:], x2[40:], essential=True, K1=given),
+        eg.estimate_two_view(x1, x2, given),
+    ):
+        assert ("wrong calibration" in result.flags) == told
+        assert result.success != told
+
+
+def test_a_plane_agrees_with_any_calibration() -> None:
+    x1, x2, _ = scene("plane", 100, 0.0, 14)
+    given = K * [[1.3, 1.0, 1.0], [1.0, 1.3, 1.0], [1.0, 1.0, 1.0]]
+    assert "wrong calibration" not in eg.estimate_essential(x1, x2, given).flags
