@@ -61,6 +61,9 @@ _NEAR, _ASTRAY, _REPEATED, _PLAIN = 2.0, 0.3, 0.2, 0.55
 #: only it explains by so much more each than those that only the other does.
 _GAIN, _BETTER = 1.05, 1.2
 
+#: Right matches that are more than those which fit by chance.
+_ENOUGH = 14
+
 #: Standard deviation of the noise that the 8-point estimate is judged with.
 _BLIND = 0.07
 
