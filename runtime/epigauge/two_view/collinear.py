@@ -21,7 +21,7 @@ from epigauge.two_view.chance import (
     independent,
     log10_false_alarms,
 )
-from epigauge.two_view.evidence import ROUNDING, Evidence
+from epigauge.two_view.evidence import Evidence
 from epigauge.two_view.homography import plane_squares
 from epigauge.two_view.planes import FAR_OFF, MOST_ON, POOL, threes
 
@@ -40,6 +40,9 @@ _FIXED = {1: 5, 2: 3}
 _PLANE = 2
 
 _REFITS = 3
+
+#: Points of single precision, as databases hold them, are rounded by so much, conditioned.
+_SINGLE = 1e-7
 
 #: A weight below this is none: the noise of a match is that of weight one over its root.
 _LIGHT = 1e-100
@@ -156,7 +159,7 @@ def _off_line(q: Array, noise: float) -> Mask | None:
     ndarray of bool, shape (n,), or None
         Points off the line.
     """
-    noise = max(noise, ROUNDING)
+    noise = max(noise, _SINGLE)
     distances = _distances(q, FAR_OFF * noise)
     on = distances <= FAR_OFF * noise
     if np.mean(on) < MOST_ON or np.mean(distances[on] ** 2) > (_SPREAD * noise) ** 2:
