@@ -95,11 +95,18 @@ FLAGS = {
         "trust the standard deviations, or look past the point in some images",
     ),
     "critical motion": Flag(
-        "the views turn about one axis or look at one point, and a focal length is uncertain by "
-        "more than a twentieth, or hangs on the distortion by as much: the shape of the scene with "
-        "it",
+        "the views turn about one axis or look at one point, and a focal length hangs on the "
+        "distortion by more than a twentieth, which no standard deviation covers: the shape of the "
+        "scene with it",
         "take images with the camera tilted and looking past the object, or give the focal length",
         ("views",),
+    ),
+    "outside the images": Flag(
+        "more than 15 % of the observations lie outside of their images: wrong sizes, or another "
+        "origin than the centre of the top left pixel; principal points were sought near the "
+        "centres of the images",
+        "give width and height in the pixels of the tracks, and add the place of the origin, as of "
+        "the centre of the image, to the coordinates",
     ),
     "weak focal length": Flag(
         "the standard deviation of a focal length exceeds a twentieth of it",

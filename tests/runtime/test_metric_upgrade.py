@@ -160,17 +160,17 @@ def test_bad_arguments_are_named(arguments: dict, named: str) -> None:
     assert error.value.argument == named
 
 
-@pytest.mark.parametrize("moved", [(-400.0, -300.0), (0.0, -600.0), (300.0, 0.0)])
+@pytest.mark.parametrize("moved", [(-400.0, -300.0), (300.0, 0.0)])
 def test_tracks_from_another_corner_are_told(moved: tuple[float, float]) -> None:
     tracks, _ = tracks_of()
     other = eg.Tracks(tracks.view, tracks.point, tracks.xy + moved)
-    with pytest.raises(eg.ArgumentError, match="lie outside of the images") as error:
-        eg.metric_upgrade(other, image_size=SIZE)
-    assert error.value.argument == "image_size"
+    assert "outside the images" in eg.metric_upgrade(other, image_size=SIZE).flags
     # A few gross errors beside the images are none of the origin.
     few = tracks.xy.copy()
     few[::20] += 2000.0
-    assert eg.metric_upgrade(eg.Tracks(tracks.view, tracks.point, few), image_size=SIZE).success
+    found = eg.metric_upgrade(eg.Tracks(tracks.view, tracks.point, few), image_size=SIZE)
+    assert found.success
+    assert "outside the images" not in found.flags
 
 
 def test_a_reconstruction_of_other_tracks_is_refused() -> None:

@@ -14,7 +14,7 @@ from epigauge.errors import ArgumentError
 from epigauge.metric.scene import Images
 from epigauge.multi_view.tracks import Tracks
 
-__all__ = ["images_of", "priors_of"]
+__all__ = ["images_of", "outside", "priors_of"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -33,7 +33,11 @@ def images_of(tracks: Tracks, image_size: ArrayLike, shared: bool | ArrayLike) -
     if not (np.isfinite(sizes) & (sizes >= 1.0)).all():
         raise ArgumentError("image_size", "is not positive everywhere", "pixels")
     sizes = np.broadcast_to(sizes, (n, 2)).astype(np.float64)
-    _inside(tracks, sizes)
+    away = np.any(tracks.xy < -0.5 * sizes[tracks.view], axis=1)
+    away |= np.any(tracks.xy > 1.5 * sizes[tracks.view], axis=1)
+    if away.mean() > 0.5:
+        was = "does not fit the tracks: most are far outside the images"
+        raise ArgumentError("image_size", was, "width, height in the pixels of the tracks")
     if isinstance(shared, bool | np.bool_):
         group = np.zeros(n, dtype=np.intp) if shared else np.arange(n)
     else:
@@ -45,21 +49,11 @@ def images_of(tracks: Tracks, image_size: ArrayLike, shared: bool | ArrayLike) -
     return Images(sizes, group)
 
 
-def _inside(tracks: Tracks, sizes: Array) -> None:
-    """Refuse tracks that are not in the pixels of the images, from their top left corner."""
-    margin = _BESIDE * sizes.sum(axis=1)[tracks.view, None]
-    low, high = tracks.xy < -0.5 - margin, tracks.xy > sizes[tracks.view] - 0.5 + margin
-    counts = tracks.weights > 0.0
-    share = float(np.mean((low | high).any(axis=1)[counts]))
-    if share > _OUTSIDE:
-        (x0, y0), (x1, y1) = tracks.xy[counts].min(axis=0), tracks.xy[counts].max(axis=0)
-        raise ArgumentError(
-            "image_size",
-            f"does not fit the tracks: {100.0 * share:.0f} % lie outside of the images (x from "
-            f"{x0:.6g} to {x1:.6g}, y from {y0:.6g} to {y1:.6g})",
-            "width, height in the pixels of the tracks, and (0, 0) as the centre of the top left "
-            "pixel: if their origin is another one, such as the centre of the image, add its place",
-        )
+def outside(tracks: Tracks, images: Images) -> bool:
+    """Tell whether tracks are not in the pixels of the images, from their top left corner."""
+    margin = _BESIDE * images.unit[tracks.view, None]
+    beside = (tracks.xy < -0.5 - margin) | (tracks.xy > images.sizes[tracks.view] - 0.5 + margin)
+    return bool(np.mean(beside.any(axis=1)[tracks.weights > 0.0]) > _OUTSIDE)
 
 
 def priors_of(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from epigauge.cameras import camera_model
 from epigauge.errors import ArgumentError
+from epigauge.metric.checks import outside
 from epigauge.metric.deviation import (
     beside_the_bend,
     beside_the_model,
@@ -73,17 +74,19 @@ def judged(
         turned = turn_std(known)
     motion = set(motion_flags(found, images, turned))
     if motion & _CRITICAL and known is not None and not search.priors:
-        beside = np.hypot(beside, beside_the_bend(kept, known, backend))
-    wide = np.hypot(share, beside / focal)
-    if (wide > WEAK).any():
-        flags.add("weak focal length")
-        if motion & _CRITICAL and not search.priors:
+        bent = beside_the_bend(kept, known, backend)
+        beside = np.hypot(beside, bent)
+        if (bent > WEAK * focal).any():
             flags.add("critical motion")
+    if (np.hypot(share, beside / focal) > WEAK).any():
+        flags.add("weak focal length")
     if (share > OPEN * factor).any():
         flags.add("undetermined")
     elif search.priors:  # these determine what the motion does not
         motion.discard("pure translation")
     flags |= motion
+    if outside(tracks, images):
+        flags.add("outside the images")
     of_sample = np.isin(tracks.point, search.sample.points)
     if search.misfit(fit, median(np.linalg.norm(bundle.fun[of_sample], axis=1))):
         flags.add("unlike cameras")
