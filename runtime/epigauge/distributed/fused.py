@@ -6,7 +6,7 @@ lam (V + Z^T Z) of homogeneous points in the factored route.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,10 +91,8 @@ def eliminate(
     V, depths, g = own.room(points)
     T, half = np.empty((m, b, b)), np.empty((m, b))
     sums = aligned_zeros((skyline.n, own.camera_sums))
-    taken, right = None, None
-    if pairs:
-        taken = aligned_zeros((skyline.blocks, own.pair_sums.size))
-        right = np.zeros((skyline.n, own.width))
+    taken = aligned_zeros((skyline.blocks, own.pair_sums.size))
+    right = np.zeros((skyline.n, own.width))
     status = function("bundle_eliminate")(
         *(own.reference, 0, len(own.layout.lanes) - 1, address(inner), address(points), lam),
         TRACE if own.model.metric else BLOCK,
@@ -103,7 +101,7 @@ def eliminate(
     )
     checked(status & 1)
     normal = own.gathered((inner, points), sums, V, depths, g)
-    found: Any = None
-    if taken is not None and right is not None:
-        found, right = NativePairs(own, skyline, taken, own.pair_sums), own.wide(right)
-    return Elimination(normal, T, half, bool(status), found, right)
+    if not pairs:
+        return Elimination(normal, T, half, bool(status))
+    there = NativePairs(own, skyline, taken, own.pair_sums)
+    return Elimination(normal, T, half, bool(status), there, own.wide(right))
