@@ -40,7 +40,7 @@ GIVEN: dict[Any, list[str]] = {
 }
 
 #: Options whose value is a file to read or an address, and those that need another input.
-INPUTS = {"start", "cache", "scheduler", "colmap", "seed"}
+INPUTS = {"start", "cache", "scheduler", "colmap", "seed", "lines"}
 #: What an option is for, where the samples of the command's own argument do not have it.
 NEEDS: dict[str, dict[str, list[str]]] = {
     "precision": {"tracks": ["made/scene.npz"]},

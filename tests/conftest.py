@@ -50,7 +50,7 @@ PAIRS = (
 SURFACE = (
     *("package/test_distribution.py", "package/test_documents.py", "package/test_metadata.py"),
     *("package/test_newcomer.py", "runtime/test_benchmarks.py", "runtime/test_cli_*.py"),
-    *("runtime/test_colmap.py", "runtime/test_colmap_hostile.py", "runtime/test_datasets.py"),
+    *("runtime/test_colmap*.py", "runtime/test_datasets.py"),
     *("runtime/test_database_executors.py", "runtime/test_display.py", "runtime/test_fuzz.py"),
     *("runtime/test_images.py", "runtime/test_interop.py", "runtime/test_io*.py"),
     *("runtime/test_line_files.py", "runtime/test_match_files.py", "runtime/test_pages_*.py"),

@@ -47,22 +47,17 @@ def copy(tmp_path, files, monkeypatch):
 
 
 @pytest.mark.slow
-def test_regeneration_is_byte_identical_under_two_hash_seeds(tmp_path):
-    source = str(Path(epigauge_derive.__file__).parents[1])
-    runs = []
-    for seed in ("1", "2"):
-        environment = os.environ | {"PYTHONHASHSEED": seed, "PYTHONPATH": source}
-        command = [sys.executable, "-m", "epigauge_derive", "--output", str(tmp_path / seed)]
-        runs.append(
-            subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, cwd=tmp_path)
-        )
-    for run in runs:
-        assert run.wait(300) == 0
-        assert run.stdout.read()
-        run.stdout.close()
-    first, second = tree(tmp_path / "1"), tree(tmp_path / "2")
-    assert first == second
-    assert generator.differences(GENERATED, {k: v.decode() for k, v in first.items()}) == ""
+def test_regeneration_is_byte_identical_under_another_hash_seed(tmp_path):
+    """What is checked in was written, and is checked by tox, under hash seeds of chance."""
+    environment = os.environ | {
+        "PYTHONHASHSEED": "1",
+        "PYTHONPATH": str(Path(epigauge_derive.__file__).parents[1]),
+    }
+    command = [sys.executable, "-m", "epigauge_derive", "--output", str(tmp_path)]
+    run = subprocess.run(command, env=environment, capture_output=True, cwd=tmp_path, check=True)
+    assert run.stdout
+    written = {name: content.decode() for name, content in tree(tmp_path).items()}
+    assert generator.differences(GENERATED, written) == ""
 
 
 def check(root):

@@ -29,13 +29,24 @@ def shares(kind: str, m: int, noise: float, trials: int, **options: object) -> d
 
 
 class TestSimulated:
-    @pytest.mark.parametrize(("m", "noise"), [(20, 0.3), (50, 1.5), (200, 0.5)])
+    @pytest.mark.parametrize(
+        ("m", "noise"),
+        [(20, 0.3), pytest.param(50, 1.5, marks=pytest.mark.slow), (200, 0.5)],
+    )
     def test_general_scene_raises_nothing(self, m, noise) -> None:
         share = shares("general", m, noise, 12)
         assert share.pop("near-affine") <= 0.2
         assert not any(share.values()), share
 
-    @pytest.mark.parametrize(("m", "noise"), [(12, 0.5), (20, 1.5), (50, 0.3), (200, 1.0)])
+    @pytest.mark.parametrize(
+        ("m", "noise"),
+        [
+            (12, 0.5),
+            pytest.param(20, 1.5, marks=pytest.mark.slow),
+            pytest.param(50, 0.3, marks=pytest.mark.slow),
+            (200, 1.0),
+        ],
+    )
     @pytest.mark.parametrize("kind", ["planar", "rotation"])
     def test_homographies_are_told(self, kind, m, noise) -> None:
         share = shares(kind, m, noise, 12)
