@@ -37,6 +37,7 @@ GIVEN: dict[Any, list[str]] = {
     "shell": ["bash"],
     "image_size": ["--image-size", "640", "480"],
     ("scene", "output"): ["-o", "made"],
+    ("metric", "tracks"): ["corner.csv"],
 }
 
 #: Options whose value is a file to read or an address, and those that need another input.
@@ -190,6 +191,10 @@ def prepare(run: Runner) -> list[str]:
     colmap_databases.Project().write(Path("database.db"))
     tracks = eg.load_tracks("tracks.csv")
     clean = np.arange(len(tracks)) % 50 != 0
+    # Those of the sample are from the centre of the images.
+    eg.save_tracks(
+        "corner.csv", eg.Tracks(tracks.view, tracks.point, tracks.xy + np.array([320.0, 240.0]))
+    )
     parts = {"view": tracks.view, "point": tracks.point, "xy": tracks.xy}
     np.savez("marked.npz", **parts, clean=clean)
     matches = eg.load_matches("matches.csv")

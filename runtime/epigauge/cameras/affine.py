@@ -94,6 +94,15 @@ class AffineReconstruction(ReconstructionBase):
         ------
         ArgumentError
             If the tracks are of other numbers of views or points.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> rng = np.random.default_rng(0)
+        >>> affine = eg.AffineReconstruction(rng.normal(size=(4, 2, 4)), rng.normal(size=(20, 3)))
+        >>> view, point = np.divmod(np.arange(80), 20)
+        >>> affine.project(eg.Tracks(view, point, np.zeros((80, 2)))).shape
+        (80, 2)
         """
         self.check_fits(tracks)
         P = self.P[tracks.view, :2]
@@ -106,6 +115,14 @@ class AffineReconstruction(ReconstructionBase):
         -------
         Reconstruction
             A start for perspective: its cameras have their centres at infinity.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> rng = np.random.default_rng(0)
+        >>> affine = eg.AffineReconstruction(rng.normal(size=(4, 2, 4)), rng.normal(size=(20, 3)))
+        >>> affine.to_projective().P.shape
+        (4, 3, 4)
         """
         return Reconstruction(self.P, np.column_stack([self.X, np.ones(len(self.X))]))
 

@@ -138,6 +138,14 @@ class MetricReconstruction(ReconstructionBase):
         ------
         ArgumentError
             If the tracks are of other numbers of views or points.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> true = scene.true
+        >>> true.project(scene.tracks).shape
+        (240, 2)
         """
         return np.ascontiguousarray(self._images(tracks, backend)[0].T)
 
@@ -161,6 +169,14 @@ class MetricReconstruction(ReconstructionBase):
         ------
         ArgumentError
             If the tracks are of other numbers of views or points.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> true = scene.true
+        >>> bool((true.depths(scene.tracks) > 0.0).all())
+        True
         """
         return np.asarray(self._images(tracks, backend)[1])
 
@@ -176,6 +192,15 @@ class MetricReconstruction(ReconstructionBase):
         -------
         pixels, depths : ndarray, shape (N, 2), (N,)
             As there.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> true = scene.true
+        >>> pixels, depths = true.seen(scene.tracks)
+        >>> pixels.shape, depths.shape
+        ((240, 2), (240,))
         """
         pixels, depths = self._images(tracks, None)
         return np.ascontiguousarray(pixels.T), depths
@@ -190,6 +215,14 @@ class MetricReconstruction(ReconstructionBase):
         Reconstruction
             ``P`` of this scene, and the points with a fourth coordinate one. It projects to the
             same pixels where the model has no distortion.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> true = scene.true
+        >>> true.to_projective().P.shape
+        (4, 3, 4)
         """
         Q = np.column_stack([self.X, np.ones(len(self.X))])
         return Reconstruction(self.P, Q, self.lines)

@@ -65,9 +65,11 @@ class MetricUpgrade(Result):
     --------
     >>> import epigauge as eg
     >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+    >>> xy = tracks.xy + 256.0  # from the corner of the images, not their centre
+    >>> tracks = eg.Tracks(tracks.view, tracks.point, xy)
     >>> result = eg.metric_upgrade(tracks, image_size=(512, 512))
-    >>> result.success, result.reconstruction.cameras.model, "weak focal length" in result.flags
-    (True, 'SIMPLE_RADIAL', True)
+    >>> result.reconstruction.cameras.model, "weak focal length" in result.flags
+    ('SIMPLE_RADIAL', True)
     """
 
     reconstruction: MetricReconstruction | None = field(repr=False)
@@ -113,6 +115,16 @@ class MetricUpgrade(Result):
         ------
         ArgumentError
             Where there is no scene, or nothing is left of some view.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> seen = eg.line_scene(n_views=6, n_lines=2).tracks
+        >>> seen = eg.Tracks(seen.view, seen.point, seen.xy + 500.0)  # from the corner
+        >>> upgrade = eg.metric_upgrade(seen, image_size=(1000, 1000))
+        >>> tracks, metric = upgrade.kept(seen)
+        >>> len(tracks) <= len(seen)
+        True
         """
         if self.reconstruction is None:
             raise ArgumentError("result", "has no scene", "tracks that determine one")

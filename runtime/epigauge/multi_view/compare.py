@@ -96,6 +96,14 @@ class Comparison(Result):
         -------
         str
             One line a method.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.multi_view_scene(n_views=4, n_points=20, seed=1)
+        >>> found = eg.compare(scene.tracks, methods=["covariant"])
+        >>> found.to_markdown().count("covariant")
+        1
         """
         head = ("method", "evaluations", "steps", "RMS (px)", "cost (px^2)", "seconds", "end")
         lines = ["| " + " | ".join(head) + " |", "|---|" + "---:|" * 5 + "---|"]

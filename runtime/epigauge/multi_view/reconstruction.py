@@ -71,6 +71,13 @@ class ReconstructionBase(Result):
         float
             sqrt(sum of squared residual coordinates / (2 N)), in pixels, of the N observations
             whose weight is not zero.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.multi_view_scene(n_views=4, n_points=20, seed=1)
+        >>> 0.0 < scene.true.rms_px(scene.tracks) < 2.0
+        True
         """
         counts = tracks.weights > 0.0
         with np.errstate(over="ignore"):
@@ -88,6 +95,12 @@ class ReconstructionBase(Result):
         ------
         ArgumentError
             If they are of others.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.multi_view_scene(n_views=4, n_points=20, seed=1)
+        >>> scene.true.check_fits(scene.tracks)
         """
         if (tracks.n_views, tracks.n_points) != (self.n_views, self.n_points):
             was = f"are of {tracks.n_views} views and {tracks.n_points} points"
@@ -162,6 +175,13 @@ class Reconstruction(ReconstructionBase):
         ------
         ArgumentError
             If the tracks are of other numbers of views or points.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.multi_view_scene(n_views=4, n_points=20, seed=1)
+        >>> scene.true.project(scene.tracks).shape
+        (80, 2)
         """
         self.check_fits(tracks)
         h = np.einsum("nij,nj->ni", self.P[tracks.view], self.Q[tracks.point])

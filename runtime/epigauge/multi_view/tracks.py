@@ -178,6 +178,14 @@ class Tracks(Result):
         ------
         ArgumentError
             As the constructor, of what is left.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> view, point = np.divmod(np.arange(60), 20)
+        >>> tracks, views, points = eg.Tracks.pruned(view, 2 * point, np.ones((60, 2)))
+        >>> views, points[:3]
+        (array([0, 1, 2]), array([0, 2, 4]))
         """
         views, points = _indices("view", view), _indices("point", point)
         pixels = as_array("xy", xy, "an (N, 2) array")
@@ -278,6 +286,13 @@ class Tracks(Result):
         -------
         Tracks
             All else is shared.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+        >>> tracks.weighted(np.full(len(tracks), 2.0)).weights[:2]
+        array([2., 2.])
         """
         other = copy.copy(self)
         other.weights = as_weights(weights, len(self)).copy()
@@ -331,6 +346,14 @@ class Tracks(Result):
         constant : float
             With residuals ``xy - prediction``, half their weighted sum of squares is that of the
             new tracks plus this, whatever is predicted: both have the same least squares solution.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> tracks = eg.load_tracks(eg.samples.path("tracks.csv"))
+        >>> merged, constant = tracks.merged()
+        >>> len(merged) == len(tracks), constant
+        (True, 0.0)
         """
         if not self.n_repeated:
             return self, 0.0

@@ -113,6 +113,15 @@ class ReconstructionCovariance(Result):
         -------
         ReconstructionCovariance
             In the gauge, with the reconstruction moved there.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.multi_view_scene(n_views=4, n_points=20, seed=1)
+        >>> result = eg.bundle_adjust(scene.tracks)
+        >>> spread = eg.covariance(scene.tracks, result.reconstruction)
+        >>> spread.in_gauge(eg.gauge.identity()).dense().shape
+        (128, 128)
         """
         P, Q, lines = (getattr(self.reconstruction, name) for name in ("P", "Q", "lines"))
         there = gauge.transformation(P, Q)
@@ -233,6 +242,15 @@ class ReconstructionCovariance(Result):
         -------
         ndarray, shape (k, 2, 2)
             In px^2, the same in every gauge.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.multi_view_scene(n_views=4, n_points=20, seed=1)
+        >>> result = eg.bundle_adjust(scene.tracks)
+        >>> spread = eg.covariance(scene.tracks, result.reconstruction)
+        >>> spread.of_projections([0, 1], [3, 3]).shape
+        (2, 2, 2)
         """
         views, points = np.asarray(view), np.asarray(point)
         for name, indices, count in (
@@ -257,6 +275,15 @@ class ReconstructionCovariance(Result):
         ------
         ArgumentError
             Beyond 5000 parameters; ask for `cameras`, `points` or `projections` instead.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.multi_view_scene(n_views=4, n_points=20, seed=1)
+        >>> result = eg.bundle_adjust(scene.tracks)
+        >>> spread = eg.covariance(scene.tracks, result.reconstruction)
+        >>> spread.dense().shape
+        (128, 128)
         """
         size = self.reconstruction.P.size + self.reconstruction.Q.size
         if size > _DENSE:

@@ -225,6 +225,14 @@ class FundamentalResult(Partial):
         -------
         ndarray, shape (3, 3)
             To first order; its diagonal is infinite where the matches do not determine the epipole.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.two_view_scene(seed=1)
+        >>> result = eg.refine_fundamental(scene.x1, scene.x2)
+        >>> result.epipole_covariance(1).shape
+        (3, 3)
         """
         return self._uncertainty.of_epipole(_image(image))
 
@@ -241,6 +249,14 @@ class FundamentalResult(Partial):
         ndarray, shape (2, 2)
             To first order, which is good while the epipole is many deviations from infinity; its
             diagonal is infinite for an epipole at infinity or not determined.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.two_view_scene(seed=1)
+        >>> result = eg.refine_fundamental(scene.x1, scene.x2)
+        >>> result.epipole_px_covariance(1).shape
+        (2, 2)
         """
         return self._uncertainty.of_epipole_px(_image(image))
 

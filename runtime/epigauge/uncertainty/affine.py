@@ -108,6 +108,18 @@ class AffineCovariance(Result):
         -------
         AffineCovariance
             In the datum; the reconstruction is the same.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> rng = np.random.default_rng(0)
+        >>> affine = eg.AffineReconstruction(rng.normal(size=(4, 2, 4)), rng.normal(size=(20, 3)))
+        >>> view, point = np.divmod(np.arange(80), 20)
+        >>> blank = eg.Tracks(view, point, np.zeros((80, 2)))
+        >>> xy = affine.project(blank) + rng.normal(0, 0.1, (80, 2))
+        >>> spread = eg.covariance(eg.Tracks(view, point, xy), affine)
+        >>> spread.in_gauge(eg.gauge.inner([0, 1, 2, 3])).point(0).shape
+        (3, 3)
         """
         there = _projection(gauge, self.reconstruction, self._inverse, self._back[1])
         return replace(self, gauge=gauge, _projection=there)
@@ -124,6 +136,18 @@ class AffineCovariance(Result):
         -------
         ndarray, shape (8, 8)
             Of the first two rows of P, row by row.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> rng = np.random.default_rng(0)
+        >>> affine = eg.AffineReconstruction(rng.normal(size=(4, 2, 4)), rng.normal(size=(20, 3)))
+        >>> view, point = np.divmod(np.arange(80), 20)
+        >>> blank = eg.Tracks(view, point, np.zeros((80, 2)))
+        >>> xy = affine.project(blank) + rng.normal(0, 0.1, (80, 2))
+        >>> spread = eg.covariance(eg.Tracks(view, point, xy), affine)
+        >>> spread.camera(0).shape
+        (8, 8)
         """
         return self.between(("camera", i), ("camera", i))
 
@@ -139,6 +163,18 @@ class AffineCovariance(Result):
         -------
         ndarray, shape (3, 3)
             In the unit of the scene.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> rng = np.random.default_rng(0)
+        >>> affine = eg.AffineReconstruction(rng.normal(size=(4, 2, 4)), rng.normal(size=(20, 3)))
+        >>> view, point = np.divmod(np.arange(80), 20)
+        >>> blank = eg.Tracks(view, point, np.zeros((80, 2)))
+        >>> xy = affine.project(blank) + rng.normal(0, 0.1, (80, 2))
+        >>> spread = eg.covariance(eg.Tracks(view, point, xy), affine)
+        >>> spread.point(3).shape
+        (3, 3)
         """
         return self.between(("point", j), ("point", j))
 
@@ -159,6 +195,18 @@ class AffineCovariance(Result):
         ------
         ArgumentError
             On parts that do not exist.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> rng = np.random.default_rng(0)
+        >>> affine = eg.AffineReconstruction(rng.normal(size=(4, 2, 4)), rng.normal(size=(20, 3)))
+        >>> view, point = np.divmod(np.arange(80), 20)
+        >>> blank = eg.Tracks(view, point, np.zeros((80, 2)))
+        >>> xy = affine.project(blank) + rng.normal(0, 0.1, (80, 2))
+        >>> spread = eg.covariance(eg.Tracks(view, point, xy), affine)
+        >>> spread.between(("camera", 0), ("point", 3)).shape
+        (8, 3)
         """
         (first, low1, out1), (second, low2, out2) = self._part("a", a), self._part("b", b)
         block = self._inverse.block(first, second) + low1 @ self._projection.M @ low2.T

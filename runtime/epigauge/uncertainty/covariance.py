@@ -122,6 +122,15 @@ class MetricCovariance(GaugeFreeLines, Result):
         -------
         MetricCovariance
             In the datum; the reconstruction is the same.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, refine="f")
+        >>> spread = eg.covariance(scene.tracks, result.reconstruction, refine="f")
+        >>> spread.in_gauge(eg.gauge.inner([0, 1, 2])).point(0).shape
+        (3, 3)
         """
         there = replace(self, gauge=gauge)
         _ = there._projection  # raises where the datum is none
@@ -144,6 +153,15 @@ class MetricCovariance(GaugeFreeLines, Result):
         -------
         ndarray, shape (6, 6)
             Radians about the axes of the scene, and the unit of the scene.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, refine="f")
+        >>> spread = eg.covariance(scene.tracks, result.reconstruction, refine="f")
+        >>> spread.camera(1).shape
+        (6, 6)
         """
         return self.between(("camera", i), ("camera", i))
 
@@ -159,6 +177,15 @@ class MetricCovariance(GaugeFreeLines, Result):
         -------
         ndarray, shape (k, k)
             Zero where a parameter is not refined.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, refine="f")
+        >>> spread = eg.covariance(scene.tracks, result.reconstruction, refine="f")
+        >>> spread.intrinsics(0).shape
+        (3, 3)
         """
         return self.between(("intrinsics", c), ("intrinsics", c))
 
@@ -169,6 +196,15 @@ class MetricCovariance(GaugeFreeLines, Result):
         -------
         list of tuple
             Camera, name, value, standard deviation, unit.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, refine="f")
+        >>> spread = eg.covariance(scene.tracks, result.reconstruction, refine="f")
+        >>> spread.intrinsic_rows()[0][:2]
+        (0, 'f')
         """
         cameras = self.reconstruction.cameras
         model = camera_model(cameras.model)
@@ -225,6 +261,15 @@ class MetricCovariance(GaugeFreeLines, Result):
         -------
         ndarray, shape (3, 3)
             In the unit of the scene.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, refine="f")
+        >>> spread = eg.covariance(scene.tracks, result.reconstruction, refine="f")
+        >>> spread.point(3).shape
+        (3, 3)
         """
         return self.between(("point", j), ("point", j))
 
@@ -240,6 +285,17 @@ class MetricCovariance(GaugeFreeLines, Result):
         -------
         ndarray, shape (6, 6)
             Of rank four: n in the unit of the scene, about its origin.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> lines = scene.line_tracks
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, lines=lines, refine="pose")
+        >>> found = result.reconstruction
+        >>> spread = eg.covariance(scene.tracks, found, lines=lines, refine="pose")
+        >>> spread.line(1).shape
+        (6, 6)
         """
         return self.between(("line", k), ("line", k))
 
@@ -259,6 +315,17 @@ class MetricCovariance(GaugeFreeLines, Result):
         -------
         ndarray, shape (4, 4)
             Of x in radians, and of phi: half the share by which the distance changes.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> lines = scene.line_tracks
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, lines=lines, refine="pose")
+        >>> found = result.reconstruction
+        >>> spread = eg.covariance(scene.tracks, found, lines=lines, refine="pose")
+        >>> spread.line_update(1).shape
+        (4, 4)
         """
         self._part("k", ("line", k))
         part = (None, self.reconstruction.n_points + int(k))
@@ -285,6 +352,15 @@ class MetricCovariance(GaugeFreeLines, Result):
         ------
         ArgumentError
             On parts that do not exist.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, refine="f")
+        >>> spread = eg.covariance(scene.tracks, result.reconstruction, refine="f")
+        >>> spread.between(("camera", 0), ("point", 3)).shape
+        (6, 3)
         """
         first, second = self._part("a", a), self._part("b", b)
         block = self._inverse.block(first.part, second.part)
@@ -305,6 +381,15 @@ class MetricCovariance(GaugeFreeLines, Result):
         ndarray, shape (k, k)
             Their numbers one after another; propagate it by derivatives to whatever follows from
             them.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, refine="f")
+        >>> spread = eg.covariance(scene.tracks, result.reconstruction, refine="f")
+        >>> spread.joint([("camera", 0), ("point", 3)]).shape
+        (9, 9)
         """
         return np.block([[self.between(a, b) for b in parts] for a in parts])
 

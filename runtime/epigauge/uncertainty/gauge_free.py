@@ -47,6 +47,16 @@ class GaugeFree:
         tuple of float
             In the unit of the scene. The deviation is the same in every datum where priors hold
             the scale; else it is that in the datum, and only ratios are free of it.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, refine="f")
+        >>> spread = eg.covariance(scene.tracks, result.reconstruction, refine="f")
+        >>> length, deviation = spread.distance(0, 1)
+        >>> 0.0 < deviation < length
+        True
         """
         length, slope = self._length(i, j)
         return length, self._sigma([("point", i), ("point", j)], slope)
@@ -63,6 +73,16 @@ class GaugeFree:
         -------
         tuple of float
             First over second.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, refine="f")
+        >>> spread = eg.covariance(scene.tracks, result.reconstruction, refine="f")
+        >>> ratio, deviation = spread.ratio((0, 1), (2, 3))
+        >>> 0.0 < deviation < ratio
+        True
         """
         (a, over_a), (b, over_b) = self._length(*first), self._length(*second)
         slope = np.concatenate([over_a / b, -a / b**2 * over_b])
@@ -80,6 +100,16 @@ class GaugeFree:
         -------
         tuple of float
             In radians.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, refine="f")
+        >>> spread = eg.covariance(scene.tracks, result.reconstruction, refine="f")
+        >>> angle, deviation = spread.angle(0, 1, 2)
+        >>> 0.0 < deviation < angle
+        True
         """
         X = self.reconstruction.X
         sides = X[i] - X[vertex], X[j] - X[vertex]
@@ -109,6 +139,15 @@ class GaugeFree:
         covariance : ndarray, shape (6, 6)
             Of the small rotation of j about the axes of view i, and of c: the same in every datum,
             but for the scale where nothing holds it.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, refine="f")
+        >>> spread = eg.covariance(scene.tracks, result.reconstruction, refine="f")
+        >>> spread.relative_pose(0, 1)[2].shape
+        (6, 6)
         """
         both = self.joint([("camera", i), ("camera", j)])
         scene = self.reconstruction
@@ -133,6 +172,15 @@ class GaugeFree:
         -------
         ndarray, shape (k, 2, 2)
             In px^2, the same in every datum.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, refine="f")
+        >>> spread = eg.covariance(scene.tracks, result.reconstruction, refine="f")
+        >>> spread.of_projections([0, 1], [3, 3]).shape
+        (2, 2, 2)
         """
         views, points = np.asarray(view), np.asarray(point)
         for name, indices in (("view", views), ("point", points)):

@@ -38,6 +38,18 @@ class GaugeFreeLines(GaugeFree):
         ------
         ArgumentError
             On parts that do not exist, or a point on the line.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> lines = scene.line_tracks
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, lines=lines, refine="pose")
+        >>> found = result.reconstruction
+        >>> spread = eg.covariance(scene.tracks, found, lines=lines, refine="pose")
+        >>> distance, deviation = spread.line_distance(0, 1)
+        >>> 0.0 < deviation < distance
+        True
         """
         self._part("point", ("point", point))
         X, L = self.reconstruction.X[point], self._one("line", line)
@@ -66,6 +78,18 @@ class GaugeFreeLines(GaugeFree):
         ------
         ArgumentError
             On lines that do not exist, or parallel ones.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene(n_views=4, n_lines=2)
+        >>> lines = scene.line_tracks
+        >>> result = eg.bundle_adjust(scene.tracks, scene.true, lines=lines, refine="pose")
+        >>> found = result.reconstruction
+        >>> spread = eg.covariance(scene.tracks, found, lines=lines, refine="pose")
+        >>> angle, deviation = spread.line_angle(0, 1)
+        >>> 0.0 < deviation < angle
+        True
         """
         first, second = self._one("i", i), self._one("j", j)
         if not np.linalg.norm(np.cross(first[3:], second[3:])) > _ROUNDING:
