@@ -312,7 +312,8 @@ def _verified(
     if pair.reason:
         return told(-1, note=pair.reason)
     # Copies tell nothing more.
-    different = len(np.unique(earliest(*map(np.ascontiguousarray, (pair.x1, pair.x2)))))
+    first = earliest(np.ascontiguousarray(pair.x1), np.ascontiguousarray(pair.x2))
+    different = len(np.unique(first))
     if different < min_inliers:
         return told(_DEGENERATE, note=f"{different} matches")
     try:
