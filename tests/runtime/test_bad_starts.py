@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import epigauge as eg
 import numpy as np
 import pytest
 from epigauge.bundle import dampings, problem
+from epigauge.multi_view.verdicts.verdict import poor_fit
 from epigauge.reproduce.gauge_runs import moved, random_transformation
 
 
@@ -123,6 +125,28 @@ def test_a_fit_that_misses_most_observations_is_no_success(seed: int) -> None:
         found = eg.bundle_adjust(wrong, start, **({"refine": "pose"} if start is truth else {}))
         assert "poor fit" in found.flags
         assert not found.success
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_reflected_scene_is_no_success(seed: int) -> None:
+    """Behind all cameras, points have the same images."""
+    tracks, truth = arc(seed)
+    start = replace(truth, X=-truth.X, t=-truth.t)
+    found = eg.bundle_adjust(tracks, start, refine="pose")
+    if found.n_behind == 0:  # it found its way to the front
+        assert found.success
+        return
+    assert found.rms_px < 1.0
+    assert {"poor fit", "behind the cameras"} <= {*found.flags}
+    assert not found.success
+
+
+def test_each_sign_of_a_poor_fit_suffices() -> None:
+    assert not poor_fit(lambda limit: limit < 5.0, 1.0, 100.0, 0.5)
+    assert poor_fit(lambda limit: limit < 11.0, 1.0, 100.0, 0.0)  # half of all observations
+    assert poor_fit(lambda limit: False, 3.0, 100.0, 0.1)  # some views
+    assert not poor_fit(lambda limit: False, 3.0, 100.0, 0.01)
+    assert poor_fit(lambda limit: False, 0.0, 100.0, 1.0)  # reflected
 
 
 @pytest.mark.parametrize("weight", [1e-6, 1e6])

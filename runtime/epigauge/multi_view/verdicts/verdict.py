@@ -11,10 +11,13 @@ __all__ = ["FITS", "Verdict", "poor_fit"]
 FITS = 0.05
 
 #: Median distance of the observations from their images, as a share of the same, above which a
-#: minimum is not that of the tracks: wrong ones have a fifth and more. Where some views only are
-#: wrong, more than such a share of the observations is behind its camera, and the RMS of the
-#: residuals is beyond so much.
+#: minimum is not that of the tracks. Where some views only are wrong, more than such a share of the
+#: observations is behind its camera, and the RMS of the residuals is beyond so much.
 _MISSES, _BEHIND, _WRONG = 0.1, 0.05, 0.02
+
+#: Share of the observations that are behind their cameras in a scene reflected in its centre, which
+#: has the same images: more than noise leaves of points that are all far away.
+_REFLECTED = 0.6
 
 
 @dataclass(frozen=True)
@@ -55,4 +58,6 @@ def poor_fit(misses: Callable[[float], bool], rms: float, scale: float, behind: 
     behind : float
         Share of the observations whose point is behind the camera.
     """
-    return misses(_MISSES * scale) or (behind > _BEHIND and rms > _WRONG * scale)
+    if behind > _REFLECTED or (behind > _BEHIND and rms > _WRONG * scale):
+        return True
+    return misses(_MISSES * scale)
