@@ -180,8 +180,9 @@ FLAGS = {
     ),
     "poor fit": Flag(
         "most observations are far from the images of their points, by more than a tenth of the "
-        "spread of the image coordinates, or some by a fiftieth and points behind their cameras, or "
-        "most points are behind them, as in a reflected scene: a wrong minimum, or wrong matches",
+        "spread of the image coordinates; or some are by a fiftieth, with points behind their "
+        "cameras; or most points are behind them, as in a reflected scene: a wrong minimum, or "
+        "wrong matches",
         "begin elsewhere, or look for wrong matches",
         ("views",),
     ),
