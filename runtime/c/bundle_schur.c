@@ -25,11 +25,12 @@ typedef struct {
     double *reduced;
 } elimination;
 
-/* The lower triangles of the pairs of a view with itself, of which the direct route sums the upper. */
+/* The lower triangles of the pairs of a view with itself, of which the direct route sums the upper;
+   nothing where there are no pairs (NULL). */
 static void mirror(const eg_route *route, const eg_envelope *envelope, double *pairs)
 {
     const ptrdiff_t K = route->tangent, length = route->pair_sums.length;
-    for (ptrdiff_t i = 0; !route->factored && i < envelope->n; ++i) {
+    for (ptrdiff_t i = 0; pairs && !route->factored && i < envelope->n; ++i) {
         double *own = pairs + route->pair_sums.size * (envelope->slot[i + 1] - 1);
         for (ptrdiff_t k = 0; k < K; ++k)
             for (ptrdiff_t l = 0; l < k; ++l)

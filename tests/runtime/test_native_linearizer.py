@@ -20,6 +20,7 @@ from epigauge.bundle.run import bundle_problem
 from epigauge.bundle.skyline import Skyline, narrow
 from epigauge.bundle.ties import Ties
 from epigauge.cameras import CameraModel, camera_model, models
+from epigauge.distributed import fused
 from epigauge.errors import BackendError
 from epigauge.two_view.losses import LOSSES, Loss
 from laws import distance
@@ -239,6 +240,30 @@ class TestParts:
         (_, costs), (_, costs_b) = (e.refine_points(at.cameras, at.points, how) for e in pair)
         assert relative(costs, costs_b) < 1e-8
         assert (costs <= pair[1].point_costs(at.cameras, at.points)).all()
+
+
+class TestFusedPass:
+    @pytest.mark.parametrize("name", ["bal", "SIMPLE_RADIAL", "FULL_OPENCV", "projective"])
+    def test_without_pairs_all_else_has_the_same_bits(
+        self, name: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        at = scene(name, 6, 60, 0.6)
+        parts, shapes = (at.native(at.loss("linear")), at.cameras, at.points, 0.01), []
+
+        def zeros(shape: tuple[int, ...]) -> Array:
+            shapes.append(shape)
+            return _native.aligned_zeros(shape)
+
+        monkeypatch.setattr(fused, "aligned_zeros", zeros)
+        whole, alone = fused.eliminate(*parts, pairs=True), fused.eliminate(*parts, pairs=False)
+        assert whole.pairs is not None
+        assert alone.pairs is None
+        # Of many views, room for the pairs would be more than there is.
+        assert [len(shape) for shape in shapes] == [2, 2, 2]
+        for part in ("T", "half"):
+            np.testing.assert_array_equal(getattr(alone, part), getattr(whole, part))
+        for part in ("U", "V", "g_cameras", "g_points"):
+            np.testing.assert_array_equal(getattr(alone.normal, part), getattr(whole.normal, part))
 
 
 class TestColumns:

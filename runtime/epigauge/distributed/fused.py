@@ -91,7 +91,8 @@ def eliminate(
     V, depths, g = own.room(points)
     T, half = np.empty((m, b, b)), np.empty((m, b))
     sums = aligned_zeros((skyline.n, own.camera_sums))
-    taken = aligned_zeros((skyline.blocks, own.pair_sums.size))
+    # Those of many views, of which only products are asked for, would take all the memory.
+    taken = aligned_zeros((skyline.blocks, own.pair_sums.size)) if pairs else None
     right = np.zeros((skyline.n, own.width))
     status = function("bundle_eliminate")(
         *(own.reference, 0, len(own.layout.lanes) - 1, address(inner), address(points), lam),
@@ -101,7 +102,7 @@ def eliminate(
     )
     checked(status & 1)
     normal = own.gathered((inner, points), sums, V, depths, g)
-    if not pairs:
+    if taken is None:
         return Elimination(normal, T, half, bool(status))
     there = NativePairs(own, skyline, taken, own.pair_sums)
     return Elimination(normal, T, half, bool(status), there, own.wide(right))
