@@ -135,3 +135,39 @@ def test_every_public_name_is_in_the_reference(name: str) -> None:
     # What the package itself offers, too, is documented there.
     public = {f"epigauge.{n}" if n in eg.__all__ else f"{name}.{n}" for n in module.__all__}
     assert not public - documented - set(MODULES)
+
+
+def test_the_changelog_says_nothing_twice() -> None:
+    text = (documents.CHECKOUT / "CHANGELOG.md").read_text(encoding="utf-8")
+    lines = [line.strip(" -") for line in text.splitlines() if len(line) > 20]
+    assert [line for line in lines if lines.count(line) > 1] == []
+    entries = [" ".join(entry.split()) for entry in re.split(r"^- ", text, flags=re.MULTILINE)]
+    broken = [e for e in entries if e.count("(") != e.count(")") or e.count("`") % 2]
+    assert broken == []
+
+
+def test_the_first_page_repeats_the_numbers_of_the_results() -> None:
+    """Medians and shares below 1 px of the sets of photographs, and their range in the text."""
+    index, results = (
+        (documents.CHECKOUT / "docs" / name).read_text(encoding="utf-8")
+        for name in ("index.md", "results.md")
+    )
+    row = re.compile(r"^\| (\w+-P\d+) \| \d+ \| (.*) \|$", re.MULTILINE)
+    cell = re.compile(r"([\d.]+): [\d.]+, ([\d.]+), [\d.]+")
+    measured = {
+        name: [(float(median), 100.0 * float(share)) for median, share in cell.findall(cells)]
+        for name, cells in row.findall(results)
+        if cell.search(cells)
+    }
+    said = dict(row.findall(index))
+    assert len(said) == 3
+    assert said.keys() == measured.keys()
+    for name, cells in said.items():
+        numbers = [float(number) for number in re.findall(r"[\d.]+", cells)]
+        assert numbers[::2] == [median for median, _ in measured[name]]
+        # Both are rounded.
+        assert numbers[1::2] == pytest.approx([share for _, share in measured[name]], abs=0.56)
+    text = " ".join(index.split())
+    ours, magsac = ([cells[k][0] for cells in measured.values()] for k in (0, 2))
+    assert f"the lowest, {min(ours):.2f} to {max(ours):.2f} px" in text
+    assert f"`USAC_MAGSAC` has {min(magsac):.2f} to {max(magsac):.2f};" in text

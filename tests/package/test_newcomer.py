@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+import documents
 import html_pages
 import pytest
 
@@ -51,6 +53,22 @@ def test_what_is_wrong_is_seen() -> None:
     assert "though the input is bad" in commands.Run(["x"], 2, b"1", "epigauge: no").check(2)[0]
     assert "what is bad" in commands.Run(["x"], 2, b"", "no").check(2)[0]
     assert "warning" in commands.Run(["x"], 0, b"", "DeprecationWarning: old").check(0)[0]
+
+
+def test_pages_say_at_their_head_what_the_extra_all_does_not_bring() -> None:
+    excused, pages = newcomer().excused, {}
+    for page in documents.pages():
+        code = "\n".join(block.code for block in documents.blocks(page))
+        for name in re.findall(r"^import (torch|jax|cupy|sympy)\b", code, re.MULTILINE):
+            pages[page.name] = excused(ModuleNotFoundError(name=name), page.read_text("utf-8"))
+    assert pages == {"arrays.md": True, "camera.md": True, "derive.md": True}
+    head = "It needs SymPy, which `all` does not bring.\n"
+    missing = ModuleNotFoundError(name="sympy")
+    assert excused(missing, head)
+    assert not excused(missing, "It needs SymPy.\n")
+    assert not excused(missing, f"Words.\n\n## Later\n{head}")
+    assert not excused(ModuleNotFoundError(name="torch"), head)
+    assert not excused(ValueError("sympy"), head)
 
 
 @pytest.mark.parametrize(
