@@ -132,7 +132,7 @@ def bundle_adjust(
     output : str or path, optional
         Of a folder: another one, new or empty, to write the result to, of the same form.
     **options
-        All those of `epigauge.bundle_adjust` but `workers` and `lines`. Of a folder `refine`,
+        All those of `epigauge.bundle_adjust` but `workers` and ``lines``. Of a folder `refine`,
         `fixed_views`, `fixed_points`, `embedded`, `schedule`, `loss`, `loss_scale_px`, `ftol`,
         `xtol`, `gtol`, `max_iter`, `backend` and `callback`.
 

@@ -93,8 +93,8 @@ def bundle_adjust(
         Segments of lines, adjusted together with the points: the distances of their end points from
         the images of the lines. For metric and projective starts, with any method that adds a
         matrix, without `robust` and ``gauge_mode="implicit"``. The lines begin at those of
-        the start, or triangulated where that suits their segments better; without `lines` those of
-        the start are left out, and the result has none. `workers` does not count. Cameras with
+        the start, or triangulated where that suits their segments better; without ``lines`` those
+        of the start are left out, and the result has none. `workers` does not count. Cameras with
         distortion see end points that are undistorted once, with their covariances to first order:
         then ``refine="pose"``.
     refine : "all", "pose" or sequence of str

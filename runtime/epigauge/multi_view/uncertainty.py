@@ -371,7 +371,7 @@ def covariance(
         Observations that the reconstruction was adjusted to, with their weights: zero for those
         that were set aside.
     reconstruction : Reconstruction, MetricReconstruction or AffineReconstruction
-        Cameras and points at the minimum, and lines where they were adjusted to `lines`.
+        Cameras and points at the minimum, and lines where they were adjusted to ``lines``.
     gauge : Gauge or "inner", optional
         Of a metric reconstruction, which is not moved, the datum: "inner" (default) for inner
         constraints over all points, ``eg.gauge.inner(points=..., views=...)`` over some,
@@ -396,9 +396,9 @@ def covariance(
     backend : {"c", "numpy", "casadi"}, optional
         Where the formulas are computed.
     **of_metric
-        Of a metric reconstruction `refine`, `fixed_views`, `fixed_points`, `priors` and `lines`, as
-        they were given to `bundle_adjust`; of an affine one `fixed_views` and `fixed_points`; of a
-        projective one `lines`, with the linear loss. With
+        Of a metric reconstruction `refine`, `fixed_views`, `fixed_points`, `priors` and ``lines``,
+        as they were given to `bundle_adjust`; of an affine one `fixed_views` and `fixed_points`; of
+        a projective one ``lines``, with the linear loss. With
         lines the noise is that of both: an end point of a segment is as much more or less exact
         than a point as the `sigma` of tracks and segments say.
 
@@ -410,9 +410,9 @@ def covariance(
     Raises
     ------
     ArgumentError
-        If the reconstruction has another size, or lines and `lines` is not given, there is nothing
-        to estimate the noise from, the observations do not determine the reconstruction, or the
-        gauge is not one of `eg.gauge` and has no method `constraints`.
+        If the reconstruction has another size, or lines and ``lines`` is not given, there is
+        nothing to estimate the noise from, the observations do not determine the reconstruction, or
+        the gauge is not one of `eg.gauge` and has no method `constraints`.
 
     Notes
     -----
