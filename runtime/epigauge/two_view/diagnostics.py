@@ -8,6 +8,8 @@ is correlated: with enough matches everything is significant.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +21,7 @@ from epigauge.two_view.essential import Calibrated
 from epigauge.two_view.evidence import ROUNDING, Evidence
 from epigauge.two_view.homography import fit_homography, plane_squares
 from epigauge.two_view.planes import (
+    EPIPOLE,
     HIDDEN,
     MOST_ON,
     RELIEF,
@@ -76,8 +79,10 @@ _CHI2_8 = 20.09
 _STILL = 0.05
 
 #: Real points are hardly measured worse than to so many pixels, in a thousandth of the focal length
-#: where the coordinates are on the retina.
+#: where the coordinates are on the retina. Where they seem to be, how many agree is judged at
+#: distances of so many standard deviations.
 BLUNT = 4.0
+_DISTANCES = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 
 
 def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, ...]:
@@ -181,19 +186,23 @@ def _is_random(found: Evidence) -> bool:
 
     F follows from the direction in which matches move off the homography that most are on. A wrong
     one that is d off has any, and is within a distance l of a line with the probability
-    2 / pi asin(l / d). Noise that hides the relief of a distant scene looks alike but for its size
-    in pixels.
+    2 / pi asin(l / d); the homography leaves F the parameters of its epipole. Relief that is little
+    more than the noise shows at distances less than those of inliers: the one that tells most is
+    taken. Noise that hides the relief of a distant scene looks alike but for its size in pixels.
     """
     blunt = BLUNT / 1000.0 if found.retina else BLUNT
     if found.noise <= max(WIDE * RANGE, blunt * float(found.to_units1[0, 0])):
         return False
     H = fit_homography(found.q1, found.q2, found.weights, found.table)[0]
     apart = plane_squares(found.table, H, found.all1, found.all2)
-    with np.errstate(divide="ignore"):  # on the plane
-        sine = found.limit / np.sqrt(apart)
-    chance = float(np.mean(2.0 / np.pi * np.arcsin(np.minimum(sine, 1.0))))
-    m, agreed = len(found.inlier), int(np.count_nonzero(found.inlier))
-    return log10_false_alarms(m, agreed, chance, found.parameters) > SIGNIFICANT
+    m, alarms = len(found.inlier), []
+    for limit in np.array(_DISTANCES) * found.noise:
+        with np.errstate(divide="ignore"):  # on the plane
+            sine = np.minimum(limit / np.sqrt(apart), 1.0)
+        chance = float(np.mean(2.0 / np.pi * np.arcsin(sine)))
+        agreed = int(np.count_nonzero(found.squared <= limit**2))
+        alarms.append(log10_false_alarms(m, agreed, chance, EPIPOLE))
+    return min(alarms) + math.log10(len(alarms)) > SIGNIFICANT
 
 
 def _extent(found: Evidence) -> float:

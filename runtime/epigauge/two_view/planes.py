@@ -20,6 +20,7 @@ from epigauge.two_view.homography import fit_homography, robust_homography
 
 __all__ = [
     "BESIDE",
+    "EPIPOLE",
     "FAR_OFF",
     "GROWS",
     "HALF_ON",
@@ -78,7 +79,7 @@ _FEW_FAR = 0.02
 #: Wrong matches that the epipole can be put through when all others are in one plane; how many such
 #: pairs may be expected that as many agree with, where the agreement is one by chance; and what is
 #: side by side, as a share of the range.
-_EPIPOLE = 2
+EPIPOLE = 2
 _BY_CHANCE = 0.01
 BESIDE = 0.01
 
@@ -286,7 +287,7 @@ def _is_accidental(found: Evidence, apart: Array, off: Mask) -> bool:
     """
     agree = np.flatnonzero(off & found.inlier)
     slight = np.count_nonzero(apart[agree] <= (_SLIGHTLY * found.limit) ** 2)
-    if slight - _EPIPOLE > _FEW_SLIGHT * np.count_nonzero(found.inlier):
+    if slight - EPIPOLE > _FEW_SLIGHT * np.count_nonzero(found.inlier):
         return False
     agree = agree[_one_of_each(found.all1[:, agree], found.all2[:, agree])]
     wrong = np.concatenate([agree, np.flatnonzero(off & ~found.inlier)])
@@ -308,7 +309,7 @@ def _is_beside(distances: Array, n: int, limit: float) -> bool:
     distances = distances[distances > _TAILS * limit]
     part = np.minimum(4.0 * limit * distances / RANGE**2, 1.0)
     bar = math.log10(_BY_CHANCE / max(len(distances), 1))
-    alarms = (log10_false_alarms(n, k, p, _EPIPOLE) for k, p in enumerate(part.tolist(), 1))
+    alarms = (log10_false_alarms(n, k, p, EPIPOLE) for k, p in enumerate(part.tolist(), 1))
     return any(own <= bar for own in alarms)
 
 
@@ -338,7 +339,7 @@ def chance_pairs(chances: Array, k: int) -> float:
     float
         ``choose(n, 2) P(k - 2 or more agree)``; infinite for a k of two or less.
     """
-    more, n = k - _EPIPOLE, len(chances)
+    more, n = k - EPIPOLE, len(chances)
     if more <= 0:
         return np.inf
     fewer = np.zeros(more)  # probabilities that 0, 1, ... of the first ones agree
