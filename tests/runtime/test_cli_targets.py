@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import io
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -70,6 +71,40 @@ def test_a_result_goes_through_a_pipe() -> None:
     (track,) = (c for c in [commands.in_process("bundle", "tracks.csv", "-o", "-")] if c.code == 0)
     with np.load(io.BytesIO(track.out)) as file:
         assert file["P"].shape == (5, 3, 4)
+
+
+@pytest.mark.parametrize("name", ["scene.out", "bal.txt", "bal.txt.bz2", "bal.txt.gz", "scene.npz"])
+def test_a_scene_of_any_form_is_read_from_stdin(name: str) -> None:
+    scene = eg.line_scene(n_points=20, n_views=4, seed=1)
+    bare = eg.MetricReconstruction(scene.true.R, scene.true.t, scene.true.X, scene.true.cameras)
+    known = eg.interop.colmap_to_bal if name.startswith("bal") else lambda *both: both
+    eg.save_scene(name, *known(scene.tracks, bare))
+    options = "--refine", "pose", "--json"
+    rms = []
+    for word, stdin in ((name, b""), ("-", Path(name).read_bytes())):
+        done = commands.in_process("bundle", word, *options, stdin=stdin)
+        assert done.check(0) == []
+        rms.append(json.loads(done.out)["rms_px"])
+    assert rms[0] == rms[1]
+
+
+def test_starts_and_lines_are_read_from_stdin_too() -> None:
+    scene = eg.line_scene(n_points=20, n_views=4, seed=1)
+    bare = eg.MetricReconstruction(scene.true.R, scene.true.t, scene.true.X, scene.true.cameras)
+    eg.save_scene("scene.npz", scene.tracks, bare)
+    eg.save_line_tracks("lines.csv", scene.line_tracks)
+    words = "bundle", "scene.npz", "--refine", "pose", "--lines", "-"
+    assert commands.in_process(*words, stdin=Path("lines.csv").read_bytes()).check(0) == []
+    assert commands.in_process("bundle", "tracks.csv", "-o", "start.npz").check(0) == []
+    start = Path("start.npz").read_bytes()
+    methods = "--methods", "covariant"
+    for call in (
+        ("bundle", "tracks.csv", "--start", "-"),
+        ("compare", "tracks.csv", *methods, "--start", "-"),
+        ("bundle", "-", "--start", "-"),
+        ("compare", "-", *methods, "--start", "-"),
+    ):
+        assert commands.in_process(*call, stdin=start).check(0) == []
 
 
 def test_a_picture_goes_to_stdout() -> None:

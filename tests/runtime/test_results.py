@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import copy
+import functools
 import html.parser
 import importlib.util
 import json
 import pickle
+import tempfile
 import types
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import colmap_databases
 import epigauge as eg
 import numpy as np
 import pytest
@@ -56,6 +59,19 @@ def affine_covariance() -> eg.AffineCovariance:
     return eg.covariance(eg.Tracks(view, point, xy + rng.normal(0, 0.1, xy.shape)), found)
 
 
+@functools.cache
+def database(verified: bool) -> Any:
+    """The pairs of a COLMAP database, refined; or the raw matches of one pair, verified."""
+    n_views = 3 if verified else 2
+    with tempfile.TemporaryDirectory() as folder:
+        path = colmap_databases.Project(n_views=n_views).write(Path(folder, "database.db"))
+        if verified:
+            return eg.colmap.refine_database(path)
+        return eg.colmap.verify_database(
+            colmap_databases.change(path, "DELETE FROM two_view_geometries")
+        )
+
+
 MADE: dict[str, Callable[[], Any]] = {
     "fundamental": lambda: eg.refine_fundamental(VIEW.x1, VIEW.x2),
     "python loop": lambda: eg.refine_fundamental(VIEW.x1, VIEW.x2, backend="numpy", max_iter=2),
@@ -89,6 +105,8 @@ MADE: dict[str, Callable[[], Any]] = {
     "affine reconstruction": affine,
     "tracks": lambda: TRACKS,
     "matches": lambda: eg.Matches(VIEW.x1, VIEW.x2, name="<b>pair</b>"),
+    "database": lambda: database(verified=True),
+    "raw database": lambda: database(verified=False),
 }
 SLOW = ("robust",)
 HAS_FRONT_END = any(importlib.util.find_spec(name) for name in ("cv2", "poselib"))

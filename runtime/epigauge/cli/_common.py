@@ -6,6 +6,7 @@ import atexit
 import functools
 import logging
 import os
+import re
 import shutil
 import sys
 import tempfile
@@ -31,8 +32,17 @@ DONE, NOT_CONVERGED, BAD_INPUT = 0, 1, 2
 #: What a shell reports of a program that Ctrl-C has ended.
 INTERRUPTED = 130
 
-#: How files begin that are no text.
-_STARTS = {".npz": b"PK", ".npy": b"\x93NUMPY", ".h5": b"\x89HDF"}
+#: How files begin that are no CSV.
+_STARTS = {
+    ".npz": b"PK",
+    ".npy": b"\x93NUMPY",
+    ".h5": b"\x89HDF",
+    ".out": b"# Bundle file",
+    ".txt.bz2": b"BZh",
+    ".txt.gz": b"\x1f\x8b",
+}
+#: The first line of a BAL problem: numbers of cameras, points and observations.
+_BAL = re.compile(rb"\s*\d+[ \t]+\d+[ \t]+\d+[ \t]*\r?\n")
 
 #: Whether people are told nothing but errors.
 _quiet: ContextVar[bool] = ContextVar("quiet", default=False)
@@ -102,7 +112,8 @@ def given(path: Path) -> Path:
     content = sys.stdin.buffer.read()
     folder = tempfile.mkdtemp(prefix="epigauge-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    form = next((form for form, start in _STARTS.items() if content.startswith(start)), ".csv")
+    form = ".txt" if _BAL.match(content) else ".csv"
+    form = next((form for form, start in _STARTS.items() if content.startswith(start)), form)
     copied = Path(folder, f"stdin{form}")
     copied.write_bytes(content)
     return copied

@@ -205,7 +205,9 @@ def bundle(
     Ctrl-C stops after the evaluation being done: the best estimate so far is
     reported and saved as asked, with exit code 130.
     """
-    tracks = given(tracks)
+    source, tracks = tracks, given(tracks)
+    start = tracks if start == source else start and given(start)
+    lines = lines and given(lines)
     if is_parts(tracks):
         refuse({"gauge": gauge, "start": start, "colmap": colmap, "clean": clean, "prune": prune})
         refuse({"damping": damping, "robust": robust, "plot": plot, "precision": precision})

@@ -78,7 +78,8 @@ def compare(
     Ctrl-C stops after the evaluation being done: what has been measured so far
     is reported, with exit code 130.
     """
-    tracks = given(tracks)
+    source, tracks = tracks, given(tracks)
+    start = tracks if start == source else start and given(start)
     targets = Targets(plot, output, json=json)
     out = console()
     observed: TrackFile | SceneJob

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge._arguments import as_matches
+from epigauge._colmap_verification import DatabaseVerification
 from epigauge._results import Result
 from epigauge.cameras import AffineReconstruction, MetricReconstruction
+from epigauge.colmap import DatabaseResult
 from epigauge.errors import ArgumentError
 from epigauge.io import Matches
 from epigauge.metric.pair import FocalLengths
@@ -188,6 +190,14 @@ def _(result: FundamentalBatch) -> Figure:
     values = {"RMS (px)": result.rms_px[done], "noise (px)": result.noise_px[done]}
     good = int(np.count_nonzero(result.success))
     return _sorted(values, f"{len(result.status)} pairs, {good} of them may be used")
+
+
+@plot_result.register(DatabaseResult)
+@plot_result.register(DatabaseVerification)
+def _(result: DatabaseResult | DatabaseVerification) -> Figure:
+    """Draw the noise of the pairs and how many matches agree, from the least to the largest."""
+    values = {"noise (px)": result.noise_px, "matches that agree": result.inliers.astype(float)}
+    return _sorted(values, result._heading())
 
 
 @plot_result.register(FocalLengths)
