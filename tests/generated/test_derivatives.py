@@ -425,6 +425,9 @@ def test_every_derivative_is_checked_here():
     derived -= {name for name, s in SIGNATURES.items() if s.family == "homography"}
     # Updates, images and residuals of lines: test_lines.py.
     derived -= {name for name, s in SIGNATURES.items() if s.family == "lines"}
+    # The polynomials of three points and their roots: tests/runtime/test_metric_growth.py; those of
+    # a shared focal length against moved F and centres: tests/runtime/test_metric_upgrade.py.
+    derived -= {"three_points", "shared_focal"}
     # Camera models: test_cameras.py.
     derived -= {name for name, s in SIGNATURES.items() if s.family.startswith("cameras_")}
     # A kernel of one F each is compared with the one of a shared F in test_backends.py.

@@ -36,9 +36,14 @@ NAMED = {
 }
 
 
+#: What all gauges do alike is shown at `Gauge` and `transform`.
+GAUGES = ("identity", "reference_camera", "two_cameras", "five_points", "normalized")
+
 #: Methods that the solvers call, public to one another only, and those that draw or write what
 #: the example of a function draws or writes.
 WITHOUT = {
+    *(f"{name}.{method}" for name in GAUGES for method in ("transformation", "similarity")),
+    "normalized.moved",
     *("BundleResult.judge", "BundleResult.unjudged", "FundamentalResult.judged"),
     *("Partial.partial", "Comparison.plot", "PairwiseMatches.load", "PairwiseMatches.save"),
 }

@@ -332,7 +332,7 @@ def test_a_scene_of_no_line_is_one_without_lines(tmp_path, scene):
 
 def test_priors_and_gauges_go_with_lines(scene, adjusted):
     lines, true = scene.line_tracks, scene.true
-    options = {"lines": lines, "refine": "pose", "ftol": 1e-12}
+    options = {"lines": lines, "refine": "pose", "ftol": 1e-10}
     priors = [eg.PositionPrior(i, true.centres[i], 0.05) for i in range(8)]
     known = eg.bundle_adjust(scene.tracks, true, priors=priors, **options)
     assert known.success

@@ -48,6 +48,13 @@ class Similarity:
         -------
         Similarity
             The inverse.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> move = eg.gauge.Similarity(2.0, np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+        >>> move.inverse().positions(np.array([[2.0, 4.0, 7.0]])).tolist()
+        [[1.0, 2.0, 3.0]]
         """
         return Similarity(1.0 / self.scale, self.rotation.T, self.target, self.origin)
 
@@ -63,6 +70,13 @@ class Similarity:
         -------
         ndarray, shape (m, 3)
             Where they go.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> move = eg.gauge.Similarity(2.0, np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+        >>> move.positions(np.array([[1.0, 2.0, 3.0]])).tolist()
+        [[2.0, 4.0, 7.0]]
         """
         return np.asarray(self.scale * (X - self.origin) @ self.rotation.T + self.target)
 
@@ -78,6 +92,14 @@ class Similarity:
         -------
         ndarray, shape (L, 6)
             Where they go; v turns, and keeps its length.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> move = eg.gauge.Similarity(2.0, np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+        >>> along_x = np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+        >>> move.lines(along_x).tolist()
+        [[0.0, 1.0, 0.0, 1.0, 0.0, 0.0]]
         """
         n, v = lines[:, :3], lines[:, 3:]
         turned = v @ self.rotation.T
@@ -96,6 +118,13 @@ class Similarity:
         -------
         ndarray, shape (k, 3, 3)
             Those of the moved positions.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> move = eg.gauge.Similarity(2.0, np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+        >>> move.information(np.eye(3)[None])[0, 0].tolist()
+        [0.25, 0.0, 0.0]
         """
         return np.asarray(self.rotation @ blocks @ self.rotation.T / self.scale**2)
 
@@ -115,6 +144,15 @@ class Similarity:
         -------
         tuple of ndarray
             Cameras and points in the new frame.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> move = eg.gauge.Similarity(2.0, np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+        >>> cameras = np.eye(3, 4).reshape(1, 12)
+        >>> cameras, points = move.apply(cameras, np.array([[1.0, 2.0, 3.0]]))
+        >>> cameras.reshape(3, 4)[:, 3].tolist(), points.tolist()
+        ([0.0, 0.0, -1.0], [[2.0, 4.0, 7.0]])
         """
         pose = cameras[:, :12].reshape(-1, 3, 4)
         R = pose[:, :, :3] @ self.rotation.T
@@ -136,6 +174,14 @@ class Similarity:
         -------
         tuple of ndarray, shape (n, d, d), (m, 3, 3)
             Blocks of cameras and of points.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> move = eg.gauge.Similarity(2.0, np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+        >>> cameras, points = move.blocks(2, 5, 6)
+        >>> cameras.shape, points.shape
+        ((2, 6, 6), (5, 3, 3))
         """
         scales = np.ones(d)
         scales[3:6] = self.scale

@@ -54,6 +54,13 @@ class Source:
         -------
         str
             Where the file is.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> source = eg.datasets.Source("owner/name", "c0ffee", "data/a.npz", "0" * 64)
+        >>> source.url("https://example.org/")
+        'https://example.org/owner/name/c0ffee/data/a.npz'
         """
         return f"{base_url.rstrip('/')}/{self.repository}/{self.commit}/{self.path}"
 

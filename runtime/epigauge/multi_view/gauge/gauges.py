@@ -187,6 +187,13 @@ class five_points:
         -------
         list of int
             Their numbers.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.4, 0.3, 0.1], [0.3, 0.4, 0.1]])
+        >>> sorted(eg.gauge.five_points.choose_three(X))
+        [0, 1, 2]
         """
         out = np.linalg.norm(X - X.mean(axis=0), axis=1)
         usual = np.where(out <= np.quantile(out, 0.9), 1.0, 0.0)
@@ -214,6 +221,13 @@ class five_points:
         -------
         list of int
             Their numbers.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> Q = np.vstack([np.eye(4), np.ones((1, 4)), [[1.0, 1.0, 1.0, 0.9]]])
+        >>> len(set(eg.gauge.five_points.choose(Q)))
+        5
         """
         moved = normalized().transformation(np.zeros((0, 3, 4)), Q).apply(np.zeros((0, 3, 4)), Q)[1]
         # The loneliest point, of the smallest sum of fourth powers of cosines with all others.

@@ -62,6 +62,14 @@ class Group:
         ------
         ArgumentError
             If the reconstruction has other cameras.
+
+        Examples
+        --------
+        >>> import epigauge as eg
+        >>> scene = eg.line_scene().true
+        >>> cameras, points = eg.gauge.group("SIMPLE_PINHOLE").generators(scene)
+        >>> cameras.shape[2], points.shape[1:]
+        (7, (3, 7))
         """
         model = camera_model(self.model)
         if isinstance(reconstruction, MetricReconstruction):

@@ -61,6 +61,15 @@ class Transformation:
         -------
         P, Q : ndarray, shape (n, 3, 4), (m, 4)
             The same geometry.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> found = eg.bundle_adjust(eg.load_tracks(eg.samples.path("tracks.csv"))).reconstruction
+        >>> change = eg.gauge.two_cameras().transformation(found.P, found.Q)
+        >>> P, Q = change.apply(found.P, found.Q)
+        >>> bool(np.allclose(P[0] / P[0, 0, 0], np.eye(3, 4), atol=1e-9))
+        True
         """
         cameras = self.camera_scales[:, None, None] * (P @ self.T)
         return cameras, self.point_scales[:, None] * np.linalg.solve(self.T, Q.T).T
@@ -77,6 +86,14 @@ class Transformation:
         -------
         ndarray, shape (L, 6)
             Of length one.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> change = eg.gauge.Transformation(np.diag([2.0, 1.0, 1.0, 1.0]), np.ones(1), np.ones(1))
+        >>> along_x = np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+        >>> abs(change.lines(along_x)).tolist()
+        [[0.0, 0.0, 0.0, 1.0, 0.0, 0.0]]
         """
         return moved_lines(np.asarray(np.linalg.inv(self.T)), lines)
 
@@ -87,6 +104,16 @@ class Transformation:
         -------
         Transformation
             What undoes this one.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> found = eg.bundle_adjust(eg.load_tracks(eg.samples.path("tracks.csv"))).reconstruction
+        >>> change = eg.gauge.two_cameras().transformation(found.P, found.Q)
+        >>> there = change.apply(found.P, found.Q)
+        >>> P, Q = change.inverse().apply(*there)
+        >>> bool(np.allclose(P, found.P) and np.allclose(Q, found.Q))
+        True
         """
         return Transformation(
             np.asarray(np.linalg.inv(self.T)), 1.0 / self.camera_scales, 1.0 / self.point_scales
@@ -99,6 +126,15 @@ class Transformation:
         -------
         cameras, points : ndarray, shape (n, 12, 12), (m, 4, 4)
             They act on vect(P_i) and on Q_j.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> found = eg.bundle_adjust(eg.load_tracks(eg.samples.path("tracks.csv"))).reconstruction
+        >>> change = eg.gauge.two_cameras().transformation(found.P, found.Q)
+        >>> cameras, points = change.blocks()
+        >>> cameras.shape[1:], points.shape[1:]
+        ((12, 12), (4, 4))
         """
         table, inverse = kernels.table("numpy"), np.linalg.inv(self.T)
         cameras = table.camera_transformation(self.T[..., None], self.camera_scales)
@@ -133,6 +169,14 @@ class Gauge(Protocol):
         -------
         Transformation
             For this reconstruction.
+
+        Examples
+        --------
+        >>> import epigauge as eg, numpy as np
+        >>> found = eg.bundle_adjust(eg.load_tracks(eg.samples.path("tracks.csv"))).reconstruction
+        >>> change = eg.gauge.two_cameras().transformation(found.P, found.Q)
+        >>> change.T.shape
+        (4, 4)
         """
 
 
