@@ -106,7 +106,8 @@ int eg_bundle_schur(
 }
 
 /* `eg_bundle_linearize`, `eg_bundle_inverse_roots` and `eg_bundle_schur` in one pass, with a known
-   lambda: each observation is evaluated once. Returns 2 where a block is not positive definite. */
+   lambda: each observation is evaluated once. Without pairs (NULL) the last of these is left out.
+   Returns 2 where a block is not positive definite. */
 int eg_bundle_eliminate(
     const eg_bundle *bundle, ptrdiff_t begin, ptrdiff_t end, const double *cameras,
     const double *points, double lam, int damping, const eg_envelope *envelope, double *V, double *D,
@@ -146,9 +147,11 @@ int eg_bundle_eliminate(
             eg_scatter(&p->chunk, b, sums + size - b * M, g);
             eg_scatter(&p->chunk, b * b, roots, T);
             eg_scatter(&p->chunk, b, v, half);
-            e.route.turn(p, roots, v, kept, envelope, &e.group, pairs, e.reduced);
+            if (pairs)
+                e.route.turn(p, roots, v, kept, envelope, &e.group, pairs, e.reduced);
         }
-        e.route.pairs(&e.route, envelope, &e.group, pairs);
+        if (pairs)
+            e.route.pairs(&e.route, envelope, &e.group, pairs);
     }
     mirror(&e.route, envelope, pairs);
     elimination_end(&e, reduced);
