@@ -224,8 +224,6 @@ def kinds() -> dict[str, Kind]:
     # Near enough for 20 matches to show parallax: a flagged result would end with 1.
     pair = eg.two_view_scene(3.0, n_points=20, noise_px=0.5, seed=1)
     many = eg.multi_view_scene(n_views=4, n_points=15, visible=0.8, noise_px=0.5, seed=2)
-    t = many.tracks  # BAL has the axes of the image the other way round
-    upside_down = eg.Reconstruction(np.diag([-1.0, -1.0, 1.0]) @ many.true.P, many.true.Q)
     weights = np.linspace(0.5, 1.0, 20)
     matches = eg.Matches(pair.x1, pair.x2, weights, (640, 480), (640, 480))
     with tempfile.TemporaryDirectory() as folder:
@@ -242,7 +240,7 @@ def kinds() -> dict[str, Kind]:
             eg.save_tracks(path, many.tracks, many.true if path.suffix == ".npz" else None)
 
         def of_bal(path: Path) -> None:
-            eg.save_tracks(path, eg.Tracks(t.view, t.point, -t.xy), upside_down)
+            eg.save_scene(path, *metric_scene("bal", 2, n_points=15, n_cameras=4, noise_px=0.5))
 
         tracks = saved("t.csv", of_tracks)
         found = [
