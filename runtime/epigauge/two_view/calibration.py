@@ -12,6 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.two_view.chance import two_by_chance
 from epigauge.two_view.consensus import RANGE, WIDEST, Consensus
 from epigauge.two_view.evidence import ROUNDING, Evidence
 
@@ -58,8 +59,7 @@ def is_calibration_wrong(found: Evidence) -> bool:
     if redundancy < _LEAST:
         return False
     variance = max(of_F / redundancy, ROUNDING**2)
-    # Two more parameters: the quantile of Fisher's F with 2 and so many degrees, times 2
-    bound = redundancy * math.expm1(-2.0 / redundancy * math.log(_MISSED))
+    bound = two_by_chance(redundancy, _MISSED)
     if of_E - of_F > bound * variance and of_E > _EXCESS * variance * (redundancy + 2):
         return True
     return found.searched and _has_more(found, F, math.sqrt(variance))

@@ -37,8 +37,10 @@ __all__ = [
     "SIGNIFICANT",
     "chance_agreement",
     "chance_on_plane",
+    "chances_off_plane",
     "independent",
     "log10_false_alarms",
+    "two_by_chance",
 ]
 
 Array = NDArray[np.float64]
@@ -154,6 +156,27 @@ def _share_within(values: Array, bound: float) -> float:
     rank = min(RANK, len(values)) - 1
     wide = float(np.partition(values, rank)[rank])
     return (rank + 1) / len(values) * min(bound / wide, 1.0) if wide > 0.0 else 1.0
+
+
+def chances_off_plane(squares: Array, limit: float) -> Array:
+    """Return the probabilities that wrong matches off a plane agree with an F of it.
+
+    The line from where the homography takes a match to the match itself is an epipolar line. That
+    of a wrong one has any direction: it is within a distance l of another with the probability
+    2 / pi asin(l / d), by the squared distances d^2 from the plane.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):  # on the plane; infinitely far
+        sine = np.minimum(limit / np.sqrt(squares), 1.0)
+    return np.asarray(2.0 / np.pi * np.arcsin(sine))
+
+
+def two_by_chance(redundancy: int, probability: float) -> float:
+    """Return how many variances two parameters more take at most by chance.
+
+    Twice the quantile of Fisher's F with two and so many degrees of freedom, by which the variance
+    is known.
+    """
+    return redundancy * math.expm1(-2.0 / redundancy * math.log(probability))
 
 
 def independent(q1: Array, q2: Array) -> int:

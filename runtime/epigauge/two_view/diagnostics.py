@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.two_view.calibration import is_calibration_wrong
-from epigauge.two_view.chance import SIGNIFICANT, log10_false_alarms
+from epigauge.two_view.chance import SIGNIFICANT, chances_off_plane, log10_false_alarms
 from epigauge.two_view.collinear import is_left_open
 from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.essential import Calibrated
@@ -184,9 +184,8 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
 def _is_random(found: Evidence) -> bool:
     """Tell whether wrong matches that hardly move would agree as well.
 
-    F follows from the direction in which matches move off the homography that most are on. A wrong
-    one that is d off has any, and is within a distance l of a line with the probability
-    2 / pi asin(l / d); the homography leaves F the parameters of its epipole. Relief that is little
+    F follows from the direction in which matches move off the homography that most are on, which
+    leaves F the parameters of its epipole; wrong ones move in any. Relief that is little
     more than the noise shows at distances less than those of inliers: the one that tells most is
     taken. Noise that hides the relief of a distant scene looks alike but for its size in pixels.
     """
@@ -197,9 +196,7 @@ def _is_random(found: Evidence) -> bool:
     apart = plane_squares(found.table, H, found.all1, found.all2)
     m, alarms = len(found.inlier), []
     for limit in np.array(_DISTANCES) * found.noise:
-        with np.errstate(divide="ignore"):  # on the plane
-            sine = np.minimum(limit / np.sqrt(apart), 1.0)
-        chance = float(np.mean(2.0 / np.pi * np.arcsin(sine)))
+        chance = float(np.mean(chances_off_plane(apart, limit)))
         agreed = int(np.count_nonzero(found.squared <= limit**2))
         alarms.append(log10_false_alarms(m, agreed, chance, EPIPOLE))
     return min(alarms) + math.log10(len(alarms)) > SIGNIFICANT

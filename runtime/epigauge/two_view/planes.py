@@ -13,7 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge.two_view.chance import chance_agreement, log10_false_alarms
+from epigauge.two_view.chance import (
+    chance_agreement,
+    chances_off_plane,
+    log10_false_alarms,
+)
 from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.evidence import ROUNDING, Evidence
 from epigauge.two_view.homography import fit_homography, robust_homography
@@ -278,12 +282,10 @@ def _is_flat(found: Evidence, apart: Array) -> bool:
 def _is_accidental(found: Evidence, apart: Array, off: Mask) -> bool:
     """Tell whether no more matches off a plane agree with F than wrong ones would by chance.
 
-    The line from where the homography takes a match to the match itself is an epipolar line. That
-    of a wrong match which is d off has any direction, and is within a distance l of one with the
-    probability 2 / pi asin(l / d). Matches side by side in both images count as one: features have
-    several scales and orientations, and all of one place fix one line. Wrong matches are anywhere:
-    where more than a few are only slightly off, or more lie within a distance of the plane than
-    chance explains, that is relief.
+    Matches side by side in both images count as one: features have several scales and
+    orientations, and all of one place fix one line. Wrong matches are anywhere: where more than a
+    few are only slightly off, or more lie within a distance of the plane than chance explains, that
+    is relief.
     """
     agree = np.flatnonzero(off & found.inlier)
     slight = np.count_nonzero(apart[agree] <= (_SLIGHTLY * found.limit) ** 2)
@@ -291,10 +293,7 @@ def _is_accidental(found: Evidence, apart: Array, off: Mask) -> bool:
         return False
     agree = agree[_one_of_each(found.all1[:, agree], found.all2[:, agree])]
     wrong = np.concatenate([agree, np.flatnonzero(off & ~found.inlier)])
-    with np.errstate(invalid="ignore"):  # infinitely far
-        sine = found.limit / np.sqrt(apart[wrong])
-    chances = 2.0 / np.pi * np.arcsin(np.minimum(sine, 1.0))
-    if chance_pairs(chances, len(agree)) <= _BY_CHANCE:
+    if chance_pairs(chances_off_plane(apart[wrong], found.limit), len(agree)) <= _BY_CHANCE:
         return False
     return not _is_beside(np.sqrt(np.sort(apart[agree])), len(wrong), found.limit)
 

@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.two_view.chance import two_by_chance
 from epigauge.two_view.consensus import RANGE
 
 __all__ = ["is_of_a_turned_camera", "may_be_rotation"]
@@ -111,9 +112,7 @@ def is_of_a_turned_camera(H: Array, covariance: Array, redundancy: int) -> bool:
     bool
         Whether some K R K^-1 with K = [f, 0, u; 0, f, v; 0, 0, 1] is within the noise.
     """
-    # Two conditions that H has to meet: the quantile of Fisher's F with 2 and n, times 2
-    n = max(redundancy, 1)
-    bound = n * math.expm1(-2.0 / n * math.log(_MISSED))
+    bound = two_by_chance(max(redundancy, 1), _MISSED)  # two conditions that H has to meet
     size = float(np.linalg.norm(H))
     H = H / size
     across = (np.eye(9) - np.outer(H, H)) / size
