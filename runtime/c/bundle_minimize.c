@@ -448,7 +448,7 @@ int eg_bundle_minimize(
     for (size_t k = 0; k < kinds; next += (parts[k].size + 7) / 8 * 8, ++k)
         *parts[k].part = next;
     const eg_lm_problem problem = {&s, options->floor, cost_at_start, linearize, make_step,
-                                   cost_at_trial, accept, options->adaptive ? promised : NULL};
+                                   cost_at_trial, accept, promised, options->adaptive};
     const eg_lm_options how = {options->ftol, options->xtol, options->gtol, options->start,
                                options->least, 0, (int)options->max_iter};
     eg_lm_outcome outcome;

@@ -10,6 +10,8 @@
 #define LAM_CEILING 1e16
 #define LAM_FACTOR 10.0
 #define TINIEST 1e-300
+#define ROUNDING 1e-15
+#define NOISE 1e-12
 
 static double now(void)
 {
@@ -23,7 +25,7 @@ static double now(void)
 }
 
 /* Lambda, and how the next one is chosen: by a constant factor, then, once a step has been rejected
-   and promises are known, by the gain ratio with a growth that doubles (Nielsen). */
+   and the problem is adaptive, by the gain ratio with a growth that doubles (Nielsen). */
 typedef struct {
     double lam, growth;
     int smooth;
@@ -37,7 +39,7 @@ static void rejected(schedule *s, const eg_lm_problem *problem)
         return;
     }
     s->lam *= LAM_FACTOR;
-    s->smooth = problem->promised != NULL;
+    s->smooth = problem->adaptive;
     s->growth = 2.0;
 }
 
@@ -97,7 +99,7 @@ static int loop(const eg_lm_problem *problem, const eg_lm_options *options, doub
         if (system.decrement <= options->ftol * outcome->cost)
             return 4;
         const double ceiling = fmin(LAM_CEILING * fmax(system.size, TINIEST), 1e300);
-        for (;;) {
+        for (int tried = 0;;) {
             if (outcome->nit >= options->max_iter)
                 return 0;
             const int made = problem->step(self, next.lam, &norm);
@@ -110,8 +112,13 @@ static int loop(const eg_lm_problem *problem, const eg_lm_options *options, doub
                 record(history, outcome, trial, next.lam, norm, decrease > 0.0, begun);
                 if (decrease > 0.0)
                     break;
-                if (fabs(decrease) <= 1e-15 * outcome->cost)
+                if (fabs(decrease) <= ROUNDING * outcome->cost)
                     return 2;
+                /* More damping makes any promise small: only that of the first step tells. */
+                if (!tried && problem->promised && -decrease <= NOISE * outcome->cost
+                    && problem->promised(self) <= ROUNDING * outcome->cost)
+                    return 2;
+                tried = 1;
             }
             rejected(&next, problem);
             if (!(next.lam <= ceiling))

@@ -27,9 +27,8 @@ typedef struct {
     int (*step)(void *self, double lam, double *norm);
     double (*cost_at_trial)(void *self);
     void (*accept)(void *self);
-    /* The decrease that the step last made promises. Where it is known, the schedule is lm.py's
-       Adaptive; where this is NULL, Classic. */
-    double (*promised)(void *self);
+    double (*promised)(void *self); /* the decrease that the step last made promises, or NULL */
+    int adaptive; /* whether the schedule is lm.py's Adaptive, which asks for promises; else Classic */
 } eg_lm_problem;
 
 typedef struct {

@@ -54,6 +54,10 @@ STATUS = {
 
 _LAM_CEILING = 1e16
 
+#: Shares of the cost: what no sum of squares tells apart, and by how much rounding at most raises a
+#: cost whose points are refined to a tolerance of as much.
+_ROUNDING, _NOISE = 1e-15, 1e-12
+
 #: Most trial steps: the compiled loop keeps a row for each.
 _MAX_ITER = 1_000_000
 
@@ -317,7 +321,9 @@ def minimize(
     - ``decrement <= ftol * c`` before a step, the decrement being the decrease that the undamped
       quadratic model still promises (4); not all linear systems know it,
     - ``c <= problem.floor`` (5), or a step neither lowers nor raises the cost beyond
-      ``1e-15 * c`` (2): then rounding decides.
+      ``1e-15 * c``, or the least damped one that knows what it promises (attribute `promised`)
+      promises no more than that and raises the cost by at most ``1e-12 * c`` (2): then rounding
+      decides.
     """
     # Only a damping whose lambda has no unit can say which one is too small.
     lam_floor: float = getattr(damping, "lam_floor", 0.0)
@@ -363,6 +369,7 @@ def minimize(
             return outcome(1)
         if system.decrement() <= stopping.ftol * state.cost:
             return outcome(4)
+        rejected = False
         while True:
             if iteration >= stopping.max_iter:
                 return outcome(0)
@@ -384,8 +391,14 @@ def minimize(
                 break
             if stop:
                 return outcome(-2)
-            if abs(decrease) <= 1e-15 * state.cost:
+            if abs(decrease) <= _ROUNDING * state.cost:
                 return outcome(2)
+            # More damping makes any promise small: only that of the first step tells.
+            promised = getattr(step, "promised", math.inf)
+            settled = promised <= _ROUNDING * state.cost and -decrease <= _NOISE * state.cost
+            if settled and not rejected:
+                return outcome(2)
+            rejected = True
             lam = schedule.rejected(lam)
             if too_large(lam):
                 return outcome(-1)

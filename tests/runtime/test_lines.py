@@ -332,7 +332,7 @@ def test_a_scene_of_no_line_is_one_without_lines(tmp_path, scene):
 
 def test_priors_and_gauges_go_with_lines(scene, adjusted):
     lines, true = scene.line_tracks, scene.true
-    options = {"lines": lines, "refine": "pose", "ftol": 1e-10}
+    options = {"lines": lines, "refine": "pose", "ftol": 1e-12}
     priors = [eg.PositionPrior(i, true.centres[i], 0.05) for i in range(8)]
     known = eg.bundle_adjust(scene.tracks, true, priors=priors, **options)
     assert known.success
@@ -353,3 +353,16 @@ def test_priors_and_gauges_go_with_lines(scene, adjusted):
         again = eg.triangulate_lines(lines, found.reconstruction)
         size = np.linalg.norm(again, axis=1).max()
         assert np.median(off(again, found.reconstruction.lines)) < 1e-3 * size
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_an_adjustment_that_only_rounding_moves_has_converged(seed):
+    scene = eg.line_scene(seed=seed)
+    lines, true = scene.line_tracks, scene.true
+    priors = [eg.PositionPrior(i, true.centres[i], 0.05) for i in range(8)]
+    options = {"lines": lines, "priors": priors, "refine": "pose", "ftol": 0.0}
+    found = eg.bundle_adjust(scene.tracks, true, **options)
+    assert found.success, found.message
+    again = eg.bundle_adjust(scene.tracks, found.reconstruction, **options)
+    assert again.success, again.message
+    np.testing.assert_allclose(again.cost, found.cost, rtol=1e-12)
