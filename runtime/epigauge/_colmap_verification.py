@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 
 from epigauge import kernels
 from epigauge._arguments import as_count, as_positive
+from epigauge._logged import logger
 from epigauge._options import Backend
+from epigauge._processes import Processes
 from epigauge._results import Result
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._common import PathLike
@@ -74,6 +77,9 @@ _RANK_ONE = 16.0 * np.finfo(float).eps
 
 #: Pairs a task, tasks that wait, and pairs that are stored at a time.
 _PART, _WAITING, _STORED = 16, 16, 256
+
+#: So many pairs are verified by processes: as many as several workers take a second for.
+_MANY = 256
 
 
 @dataclass(frozen=True)
@@ -183,7 +189,8 @@ def verify_database(
     backend : {"c", "numpy", "casadi"}, optional
         Where the formulas are computed.
     workers : int
-        Threads. The results do not depend on it.
+        Threads, or processes where there are many pairs: threads of one Python wait for each
+        other. The results do not depend on it.
     executor : concurrent.futures.Executor, optional
         Where to compute, instead of threads of this process, as of `refine_fundamental_batch`; the
         database is read and written here.
@@ -236,15 +243,13 @@ def verify_database(
     found: list[Verified] = []
     stored: list[bool] = []
     kept = None
-    with (
-        RawDatabase(path, write=write) as database,
-        ThreadPoolExecutor(workers) if executor is None else nullcontext(executor) as pool,
-    ):
+    with RawDatabase(path, write=write) as database, ExitStack() as own_pool:
         ids, already = database.open_pairs()
         if not ids and not already:
             raise FileFormatError(path, "holds no raw match: match its images first")
         if write and backup and ids:
             kept = str(database.backup())
+        pool = executor or own_pool.enter_context(_pool(workers, len(ids)))
         parts = (database.raw_pairs(ids[k : k + _PART]) for k in range(0, len(ids), _PART))
         for own in _in_turn(pool, parts, options):
             found.append(own)
@@ -255,6 +260,17 @@ def verify_database(
                 database.commit()
         names = database.names()
     return _joined(found, stored, names, already, kept)
+
+
+def _pool(workers: int, pairs: int) -> Executor:
+    """Return where to compute: processes, where they gain more than the time they start in."""
+    told = logger.isEnabledFor(logging.INFO)  # which a process cannot
+    if workers > 1 and pairs >= _MANY and not told:
+        try:
+            return Processes(workers)
+        except OSError:
+            pass
+    return ThreadPoolExecutor(workers)
 
 
 class Verified(NamedTuple):

@@ -7,7 +7,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from colmap_databases import SCHEMA, change, content, pair_id
 from epigauge import _colmap_verification as verification
+from epigauge._processes import Processes
 from epigauge.io.colmap_raw import RawDatabase
 from two_views import up_to_sign
 
@@ -301,6 +302,30 @@ def test_workers_executors_and_progress_change_nothing(some) -> None:
     assert told == [(1, 3), (2, 3), (3, 3)]
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:
         the_same(one, eg.colmap.verify_database(some, executor=executor))
+
+
+def test_processes_of_their_own_change_nothing(some, monkeypatch, capfd) -> None:
+    one = eg.colmap.verify_database(some)
+    monkeypatch.setattr(verification, "_MANY", 1)
+    monkeypatch.setattr(verification, "_PART", 1)
+    monkeypatch.setattr(verification, "ThreadPoolExecutor", None)
+    the_same(one, eg.colmap.verify_database(some, workers=2))
+    with Processes(2) as pool:
+        assert pool.submit(print, "said").result() is None  # and comes not between answers
+        bad = pool.submit(verification.verified, [None], {})
+        with pytest.raises(TypeError):
+            bad.result()
+        assert pool.submit(abs, -3).result() == 3
+    assert "said" not in capfd.readouterr().out
+    with Processes(1) as pool, pytest.raises(BrokenExecutor, match="ended"):
+        pool.submit(os._exit, 1).result()
+
+
+def test_threads_compute_where_no_process_can_be_started(some, monkeypatch) -> None:
+    one = eg.colmap.verify_database(some)
+    monkeypatch.setattr(verification, "_MANY", 1)
+    monkeypatch.setattr(sys, "executable", "")
+    the_same(one, eg.colmap.verify_database(some, workers=2))
 
 
 def test_inliers_are_those_of_the_estimate(some) -> None:

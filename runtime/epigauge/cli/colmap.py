@@ -46,7 +46,7 @@ def colmap(
     ] = True,
     loss: Annotated[Loss, choice(Loss, "Of each squared residual.")] = "linear",
     max_iter: Annotated[int, typer.Option(help="Trial steps allowed a pair.")] = _MAX_ITER,
-    workers: Annotated[int, typer.Option(help="Threads.")] = 1,
+    workers: Annotated[int, typer.Option(help="Threads; processes for many raw pairs.")] = 1,
     backend: Annotated[Backend | None, choice(Backend, "See `epigauge info`.")] = None,
     from_matches: Annotated[
         bool,
