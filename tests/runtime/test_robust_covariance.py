@@ -101,6 +101,17 @@ class TestTwoViews:
     def test_truncated_loss(self, share, off) -> None:
         assert 0.75 <= mean_squared_error("truncated", share, off, 60, noise_px=None) <= 1.6
 
+    def test_a_truncated_loss_is_as_wide_as_the_right_matches_say(self) -> None:
+        """With 30 % wrong the median of all distances would make it half as wide again."""
+        rng = np.random.default_rng(11)
+        F = scene()[2]
+        pairs = (disturbed(rng, 0.3, 60.0) for _ in range(16))
+        found = [eg.refine_fundamental(*pair, loss="truncated") for pair in pairs]
+        scales = np.array([r.loss_scale_px for r in found])
+        assert np.median(scales) == pytest.approx(3.0, rel=0.15)
+        assert np.mean([r.success for r in found]) > 0.9
+        assert np.median([squared_error(r, F) for r in found]) < 1.5
+
     def test_given_noise_scales_the_covariance(self) -> None:
         x1, x2 = disturbed(np.random.default_rng(0), 0.15, 60.0)
         found = [eg.refine_fundamental(x1, x2, loss="huber", noise_px=s) for s in (0.5, 1.0, None)]

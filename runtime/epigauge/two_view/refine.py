@@ -51,7 +51,15 @@ from epigauge.two_view.parameterizations import (
     Ortho,
 )
 from epigauge.two_view.result import FundamentalResult
-from epigauge.two_view.solve import DAMPINGS, REDUNDANT, Matches, Options, stop_of
+from epigauge.two_view.solve import (
+    DAMPINGS,
+    REDESCENDING,
+    REDUNDANT,
+    Matches,
+    Options,
+    best_start,
+    stop_of,
+)
 
 __all__ = ["calibrations", "refine_fundamental"]
 
@@ -138,7 +146,9 @@ def refine_fundamental(
         Calibration matrices for `essential`; the identity by default (coordinates on the retina),
         and K1 for both where only it is given.
     loss : {"linear", "huber", "soft_l1", "cauchy", "truncated"}
-        Robust loss of each match's squared distance, defined as in SciPy.
+        Robust loss of each match's squared distance, defined as in SciPy. Where "truncated" ends
+        depends on its start: without `F0` it starts from the better of two minima, that from the
+        8-point estimate and that from Cauchy's (whose evaluations are not counted).
     loss_scale_px : float or "auto"
         Scale of the loss in pixels; by default a multiple of the noise as estimated from the
         residuals, anew until it stands still.
@@ -235,7 +245,10 @@ def refine_fundamental(
     covariances = _covariances(covariance1, covariance2, options, starts, len(x1))
     matches = Matches.of(x1, x2, w, start, kernels.table(backend), covariances)
     options = replace(options, anchor=start if options.fix else None)
-    found = search(matches, options, _starts(matches, options, start, starts), callback)
+    first = _starts(matches, options, start, starts)
+    if F0 is None and options.loss == REDESCENDING and options.calibration is None:
+        first[0] = best_start(matches, options, first[0])
+    found = search(matches, options, first, callback)
     return assembled(found, options, matches, noise_px)
 
 

@@ -19,6 +19,7 @@ from epigauge.kernels import Table
 from epigauge.linear import Levenberg, Seber
 from epigauge.two_view import native
 from epigauge.two_view.conditioning import Conditioning, condition, displaced
+from epigauge.two_view.covariance import scale_of_kept
 from epigauge.two_view.criteria import CRITERIA, Criterion, Mahalanobis, Reprojection
 from epigauge.two_view.eliminated import EliminatedProblem
 from epigauge.two_view.essential import Calibrated, Essential
@@ -37,7 +38,17 @@ from epigauge.two_view.parameterizations import (
     frozen_directions,
 )
 
-__all__ = ["DAMPINGS", "REDUNDANT", "Matches", "Options", "Solution", "joined", "minimize"]
+__all__ = [
+    "DAMPINGS",
+    "REDESCENDING",
+    "REDUNDANT",
+    "Matches",
+    "Options",
+    "Solution",
+    "best_start",
+    "joined",
+    "minimize",
+]
 
 Array = NDArray[np.float64]
 
@@ -45,6 +56,9 @@ DAMPINGS: dict[str, type[Levenberg] | type[Seber]] = {"levenberg": Levenberg, "s
 
 #: Parameterisations by cameras, more than seven parameters, always solved jointly with the points.
 REDUNDANT = ("parfree", "free", "normalized")
+
+#: The loss whose influence falls to zero: where it ends depends on the start most of all.
+REDESCENDING = "truncated"
 
 #: The scale of a loss is estimated anew until it changes by less than this (relative).
 _SCALE_SETTLED = 1e-3
@@ -210,6 +224,18 @@ def minimize(
     return replace(solution, outcome=outcome)
 
 
+def best_start(matches: Matches, options: Options, start: Array) -> Array:
+    """Return the better minimum of a redescending loss: from a start, and from Cauchy's there.
+
+    The residuals of a start that wrong matches bend are wide, and so is then the loss. Cauchy's
+    lets none of them go, and ends nearer; of both minima the one of lower cost counts.
+    """
+    smooth = replace(options, loss="cauchy", loss_scale_px=None)
+    starts = (start, minimize(matches, smooth, start).F)
+    found = (minimize(matches, options, F) for F in starts)
+    return min(found, key=lambda solution: float(solution.outcome.state.cost)).F
+
+
 def _minimize_once(
     matches: Matches,
     options: Options,
@@ -342,7 +368,10 @@ def _estimated_scale(matches: Matches, options: Options, F: Array) -> float:
     """Return the scale of the loss, in pixels, at which it is 95 % efficient for clean data."""
     criterion = matches.criterion(options.criterion)
     counts = matches.weights > 0.0
-    sigma = robust_scale(criterion.evaluate(F).signed[counts])
+    signed = criterion.evaluate(F).signed[counts]
+    sigma = robust_scale(signed)
+    if options.loss == REDESCENDING:  # it leaves wrong ones out, and so its scale can
+        sigma = scale_of_kept(signed, sigma)
     # Noise-free data: any scale will do that is not zero.
     return EFFICIENT[options.loss] * max(sigma, 1e-12) * matches.frame.scale
 
