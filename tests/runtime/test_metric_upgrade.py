@@ -285,3 +285,18 @@ class TestTwoViews:
             with pytest.raises(eg.ArgumentError) as error:
                 eg.focal_lengths(*arguments)
             assert error.value.argument == name
+
+
+@pytest.mark.parametrize(("depth", "flat"), [(0.0, True), (0.05, False)])
+def test_a_poster_is_flat_through_any_lens(depth: float, flat: bool) -> None:
+    _, truth = tracks_of(n_views=6, n_points=150, seed=8, bend=0.08)
+    X = truth.X * [1.6, 1.3, depth]
+    poster = eg.MetricReconstruction(truth.R, truth.t, X, truth.cameras)
+    view, point = np.divmod(np.arange(900), 150)
+    blank = eg.Tracks(view, point, np.zeros((900, 2)))
+    xy = poster.project(blank) + np.random.default_rng(0).normal(0.0, 0.2, (900, 2))
+    found = eg.metric_upgrade(eg.Tracks(blank.view, blank.point, xy), image_size=SIZE)
+    # No homography explains the pairs, as the lens bends lines; the cameras are right all the same.
+    assert _focal_error(found) < 0.01
+    assert ("planar scene" in found.flags) == flat
+    assert found.success != flat

@@ -48,6 +48,15 @@ _PHOTOS = (
 #: Share of a nominal focal length that it is uncertain by, and that a zoom changes it by.
 _NOMINAL, _ZOOMED = 0.1, 0.02
 
+#: What photographs do that make no scene, by the flag that tells.
+_WHY = {
+    "still camera": "are all taken from one place, in one direction",
+    "planar scene": "show something flat: all their points lie in one plane",
+    "pure rotation": "show no parallax: the camera turned in one place, or all it saw is flat",
+    "pure translation": "are by a camera that never turned: every focal length explains them",
+    "critical motion": "go about the scene in a way that leaves the focal length open",
+}
+
 _DATABASES = (".db", ".sqlite", ".sqlite3")
 
 
@@ -275,7 +284,9 @@ class _Answer:
         for name, why in self.source.left_out.items():
             out.print(f"[bold]left out:[/] {escape(name)} {escape(why)}", soft_wrap=True)
         if not result.success:
-            out.print(f"[bold red]no scene:[/] {escape(result.message)}", soft_wrap=True)
+            told = [f"the photographs {_WHY[name]}" for name in result.flags if name in _WHY]
+            reason = told[0] if told else result.message
+            out.print(f"[bold red]no scene:[/] {escape(reason)}", soft_wrap=True)
 
     def write(self, output: Path) -> None:
         """Write everything into a folder that takes its name only when it is complete."""

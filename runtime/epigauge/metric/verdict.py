@@ -19,6 +19,7 @@ from epigauge.metric.deviation import (
 )
 from epigauge.metric.motion import motion_flags
 from epigauge.metric.pair import OPEN, WEAK
+from epigauge.metric.relief import flat
 from epigauge.metric.result import MetricUpgrade
 from epigauge.metric.scene import Images
 from epigauge.metric.search import Fit, Search, metric_of
@@ -85,6 +86,11 @@ def judged(
     elif search.priors:  # these determine what the motion does not
         motion.discard("pure translation")
     flags |= motion
+    unit = float(np.median(images.unit))
+    if "pure rotation" not in flags and flat(
+        kept, found, noise_px(bundle, tracks, weights == 0.0), unit
+    ):
+        flags.add("planar scene")
     if outside(tracks, images):
         flags.add("outside the images")
     of_sample = np.isin(tracks.point, search.sample.points)
