@@ -152,9 +152,10 @@ def bundle_adjust(
 
     Notes
     -----
-    A worker that dies costs a step: its partitions are rebuilt elsewhere from the points of the
-    last accepted step, with the same result. With method "covariant" and without priors points stay
-    at the workers; otherwise they travel with each step, which costs time alone.
+    A worker that dies costs a step or a few: its partitions are rebuilt elsewhere from points that
+    the client fetches after each fourth step, and from the cameras of the steps since, with the
+    same result. With method "covariant" and without priors points stay at the workers; otherwise
+    they travel with each step, which costs time alone.
 
     Examples
     --------

@@ -90,7 +90,7 @@ class Partition:
         self.states[token] = _State(cameras, points)
 
     def linearize_state(self, token: int, lam: float, direct: bool) -> tuple[Terms, Arrays]:
-        """Linearise at a state; return the sums of cameras, what is largest, and the points.
+        """Linearise at a state; return the sums of cameras, and what is largest.
 
         With lam > 0 the sums go on with those of `eliminate`, made in the same pass; where that is
         singular, with nothing.
@@ -103,7 +103,7 @@ class Partition:
             except np.linalg.LinAlgError:
                 singular = True
         normal = self._normal(token)
-        own = {"points": state.points, "largest": 0.0, "steepest": 0.0, "singular": singular}
+        own = {"largest": 0.0, "steepest": 0.0, "singular": singular}
         if len(normal.V):
             traces = np.einsum("mii->m", normal.V) / normal.V.shape[1]
             own["largest"] = float(traces.max())
@@ -113,6 +113,10 @@ class Partition:
         if singular:
             more = tuple(Rows(rows.index[:0], rows.values[:0]) for rows in sums[:2])
         return (*sums, *more), own
+
+    def points_of_state(self, token: int) -> tuple[Terms, Array]:
+        """Return the points of a state."""
+        return (), self.states[token].points
 
     def blocks_of_state(self, token: int) -> tuple[Terms, Arrays]:
         """Return the blocks of points at a state."""

@@ -28,6 +28,10 @@ Array = NDArray[np.float64]
 
 _TOKENS = itertools.count()
 
+#: Accepted steps after which the client fetches the points: so many at most are made once more
+#: where a partition is lost.
+_REPLAYED = 4
+
 
 @dataclass(frozen=True)
 class ResidentEstimate:
@@ -116,7 +120,7 @@ class ResidentSystem(BundleSystem):
     def damped_step(self, blocks: Blocks, lam: float) -> Any:
         """Return the cameras' part of -(J^T J + lam blocks)^-1 g."""
         own, normal = self.linearizer, self.normal
-        whitening = np.linalg.inv(np.swapaxes(np.linalg.cholesky(blocks.cameras), 1, 2))
+        whitening = _inverse_roots(blocks.cameras)
         ties = self.ties.then(whitening, None).scaled(1.0 / np.sqrt(blocks.shared))
         white = congruent(ties.A, normal.U)
         white = white + lam * np.eye(white.shape[1])
@@ -180,7 +184,8 @@ class _Product:
 class ResidentProblem(BundleProblem):
     """The problem of which points stay at the workers.
 
-    The client keeps the points of the last accepted state, from which lost partitions are rebuilt.
+    The client keeps the points of an accepted state and the cameras of the steps since, from which
+    lost partitions are rebuilt.
     """
 
     held: _Held = field(kw_only=True)
@@ -225,10 +230,10 @@ class ResidentProblem(BundleProblem):
             sums = sums[:-2]
             if not any(part["singular"] for part in parts):
                 ahead = lam, found, right
-        points = own.joined([part["points"] for part in parts])
-        held.accept(token, state.cameras, points)
+        if held.accept(token) >= _REPLAYED:
+            held.take(token, state.cameras, self._points(token))
         U, g, *depth = (own.reduced.outward(rows) for rows in sums)
-        b = points.shape[1]
+        b = self.model.point_size
         none = np.zeros((0, b, b))
         blocks = (depth[0], none) if depth else None
         coupling: Any = None
@@ -240,7 +245,7 @@ class ResidentProblem(BundleProblem):
             ties,
             model=self.model,
             cameras=state.cameras,
-            points=points,
+            points=np.zeros((0, b)),
             linearizer=own,
             token=token,
             peak=max(part["largest"] for part in parts),
@@ -254,8 +259,7 @@ class ResidentProblem(BundleProblem):
         if self.model.homogeneous:
             cameras = in_range(cameras)
         reached, held = next(_TOKENS), self.held
-        assert held.state is not None
-        trial = held.state[0], step.lam, step.cameras, cameras, self.refinement, reached
+        trial = held.token, step.lam, step.cameras, cameras, self.refinement, reached
         held.trial = trial
         (total, slope, energy, squared), _ = self._own.run.each("advance", trial)
         step.take(slope, energy, squared)
@@ -266,12 +270,16 @@ class ResidentProblem(BundleProblem):
         state, system = outcome.state, outcome.system
         estimate: Any = state.estimate
         if isinstance(system, ResidentSystem):
-            # The last system is that of the state, whose points came with it.
-            points = system.points
+            # The last system is that of the state.
+            points = self._points(system.token)
             if isinstance(estimate, ResidentEstimate):
                 estimate = Estimate(state.cameras, points, estimate.steps)
             system = replace(system.whole(points), ties=self.freedom.ties)
         return replace(outcome, state=replace(state, estimate=estimate), system=system)
+
+    def _points(self, token: int) -> Array:
+        """Return the points of a state, (m, b)."""
+        return self._own.joined(self._own.run.each("points_of_state", (token,))[1])
 
     @property
     def _own(self) -> DistributedLinearizer:
@@ -280,31 +288,58 @@ class ResidentProblem(BundleProblem):
         return found
 
 
+def _inverse_roots(D: Array) -> Array:
+    """Return A with A^T D A = I for blocks (n, d, d)."""
+    diagonal = np.einsum("nii->ni", D)
+    if np.count_nonzero(D) > np.count_nonzero(diagonal):
+        return np.linalg.inv(np.swapaxes(np.linalg.cholesky(D), 1, 2))
+    roots = np.zeros_like(D)
+    np.einsum("nii->ni", roots)[...] = 1.0 / np.sqrt(diagonal)
+    return roots
+
+
 class _Held:
-    """The last accepted state and the trial that left it: what lost partitions are rebuilt from."""
+    """A state whose points are here, and the steps since: what lost partitions are rebuilt from."""
 
     def __init__(self, linearizer: DistributedLinearizer) -> None:
         self._linearizer = linearizer
-        self.state: tuple[int, Array, Array] | None = None
+        self._state: tuple[int, Array, Array] | None = None
+        self._steps: tuple[tuple[Any, ...], ...] = ()
+        #: Arguments of the `advance` to a state that is not accepted yet.
         self.trial: tuple[Any, ...] | None = None
         #: Lambda of the next step where it is known before the state is linearised, else 0; the
         #: first is that of `Covariant.start`.
         self.expected = START_METRIC if linearizer.model.metric else START
         linearizer.recover = self._recovered
 
+    @property
+    def token(self) -> int:
+        """Return the name of the last accepted state."""
+        assert self._state is not None
+        found: int = self._steps[-1][-1] if self._steps else self._state[0]
+        return found
+
     def begin(self, cameras: Array, points: Array) -> int:
         """Take a start; return its token."""
         token = next(_TOKENS)
-        self.state, self.trial = (token, cameras, points), None
+        self.take(token, cameras, points)
         return token
 
-    def accept(self, token: int, cameras: Array, points: Array) -> None:
-        """Take a state whose points have come."""
-        self.state, self.trial = (token, cameras, points), None
+    def take(self, token: int, cameras: Array, points: Array) -> None:
+        """Take an accepted state with its points."""
+        self._state, self._steps, self.trial = (token, cameras, points), (), None
+
+    def accept(self, token: int) -> int:
+        """Take the step to a state; return how many there are since the points."""
+        if self.trial is not None and self.trial[-1] == token:
+            self._steps = (*self._steps, self.trial)
+        self.trial = None
+        return len(self._steps)
 
     def _recovered(self, number: int, recipe: Recipe) -> Recipe:
-        if self.state is None:
+        if self._state is None:
             return recipe
-        token, cameras, points = self.state
+        token, cameras, points = self._state
         rows = self._linearizer.pieces[number].points
-        return replace(recipe, state=(token, cameras, points[rows]), trial=self.trial)
+        trials = self._steps if self.trial is None else (*self._steps, self.trial)
+        return replace(recipe, state=(token, cameras, points[rows]), trials=trials)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.distributed import memory
 from epigauge.distributed.observations import Observations, Setup, Source
 from epigauge.distributed.partition import Partition
 from epigauge.distributed.sums import Node, Terms, combined
@@ -33,16 +34,16 @@ class Recipe:
     kept : ndarray of bool, shape (m,), or None
         Its fixed points.
     state : tuple or None
-        Token, cameras and its points of the last state that was accepted.
-    trial : tuple or None
-        Arguments of the `advance` that led on from there.
+        Token, cameras and its points of a state that was accepted.
+    trials : tuple
+        Arguments of each `advance` that led on from there, one after the other.
     """
 
     setup: Setup | None
     source: Source | Observations
     kept: NDArray[np.bool_] | None = None
     state: tuple[int, Array, Array] | None = None
-    trial: tuple[Any, ...] | None = None
+    trials: tuple[tuple[Any, ...], ...] = ()
 
     def made(self) -> Partition | Observations:
         """Return the partition, or its observations alone."""
@@ -55,10 +56,11 @@ class Recipe:
         """Bring a partition to a state."""
         assert self.state is not None
         partition.load(*self.state)
-        if self.state[0] != token:
-            assert self.trial is not None
-            assert self.trial[-1] == token
-            partition.advance(*self.trial)
+        for trial in self.trials:
+            if token in partition.states:
+                return
+            partition.advance(*trial)
+        assert token in partition.states
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,9 @@ _HELD: dict[tuple[str, int], Any] = {}
 _LOCK = threading.Lock()
 
 #: What works at a state: its token is the first argument.
-_AT_STATE = ("linearize_state", "blocks_of_state", "eliminate", "product", "advance")
+_AT_STATE = (
+    *("linearize_state", "points_of_state", "blocks_of_state", "eliminate", "product", "advance"),
+)
 
 
 def serve(
@@ -154,6 +158,7 @@ def _partition(run: str, number: int, recipe: Recipe | None) -> Any:
     with _LOCK:
         held = _HELD.get((run, number))
     if held is None and recipe is not None:
+        memory.keep()
         held = recipe.made()
         with _LOCK:
             _HELD[run, number] = held
@@ -174,7 +179,9 @@ def _held(run: str) -> int:
 
 
 def forget(runs: Sequence[str]) -> None:
-    """Drop the partitions of runs."""
+    """Drop the partitions of runs, and with the last of all the memory that they took."""
     with _LOCK:
         for key in [key for key in _HELD if key[0] in runs]:
             del _HELD[key]
+        if not _HELD:
+            memory.give_back()
