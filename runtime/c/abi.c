@@ -20,6 +20,7 @@ EG_EXPORT ptrdiff_t eg_shared_size(const char *name)
         {"eg_options", sizeof(eg_options)},
         {"eg_outcome", sizeof(eg_outcome)},
         {"eg_mixture_options", sizeof(eg_mixture_options)},
+        {"eg_plane_options", sizeof(eg_plane_options)},
         {"eg_quick_options", sizeof(eg_quick_options)},
         {"eg_search_options", sizeof(eg_search_options)},
     };

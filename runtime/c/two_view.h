@@ -124,6 +124,14 @@ typedef struct {
     int climbs, steps;            /* at most, and of a fit */
 } eg_mixture_options;
 
+/* How to look for a plane, as in the structure of homography.py. */
+typedef struct {
+    double equal[9];              /* the homography by which all equations are weighed alike */
+    double stands, sharp, wide;   /* change that ends; medians at which weights fall, at first, then */
+    double rounding2;             /* least square */
+    int rounds;
+} eg_plane_options;
+
 /* The probability that a wrong match is within a distance of F, from so many pairs of the points of
    matches q (4, n) of which so many must be near; room has 4 n + pairs doubles. */
 double eg_chance(ptrdiff_t n, const double *F, const double *q, double limit, ptrdiff_t pairs,

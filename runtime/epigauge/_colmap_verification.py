@@ -329,7 +329,7 @@ def _verified(
         return told(-1, note=pair.reason)
     # Copies tell nothing more.
     first = earliest(np.ascontiguousarray(pair.x1), np.ascontiguousarray(pair.x2))
-    different = len(np.unique(first))
+    different = int(np.count_nonzero(first == np.arange(len(first))))
     if different < min_inliers:
         return told(_DEGENERATE, note=f"{different} matches")
     try:
@@ -371,8 +371,8 @@ def _is_watermark(pair: RawPair, inlier: Mask) -> bool:
         border = _BORDER * np.hypot(*size)
         x = raw[inlier]
         at_border &= ((x < border) | (x > np.array(size) - border)).any(axis=1)
-    if np.mean(at_border) < _AT_BORDER:
-        return False
+        if np.count_nonzero(at_border) < _AT_BORDER * len(at_border):
+            return False
     moved = (pair.raw2 - pair.raw1)[inlier]
     together = np.linalg.norm(moved - np.median(moved, axis=0), axis=1) <= _TOGETHER_PX
     return bool(np.mean(together) >= _AT_BORDER)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from epigauge import kernels
 from epigauge.two_view.conditioning import condition
+from epigauge.two_view.homography import fit_homography, robust_homography
 from epigauge.two_view.homography_problem import HomographyProblem
 from numpy.typing import NDArray
 
@@ -266,3 +267,19 @@ class TestRawMatches:
 
         told = [verdict(seed) for seed in (0, 1, 2, 8)]
         assert all(one == "not usable" or "that agree" in one for one in told), told
+
+
+@pytest.mark.skipif(kernels.available()["c"] is not None, reason="no C library")
+@pytest.mark.parametrize("m", [9, 30, 401])
+def test_compiled_planes_are_those_of_the_formulas(m) -> None:
+    rng = np.random.default_rng(m)
+    q1, w = 1.2 * rng.normal(size=(2, m)), rng.uniform(0.5, 2.0, m)
+    there = (np.eye(3) + 0.1 * rng.normal(size=(3, 3))) @ np.vstack([q1, np.ones(m)])
+    q2 = there[:2] / (2.0 + there[2]) + 1e-3 * rng.normal(size=(2, m))
+    q2[:, : m // 3] = rng.normal(size=(2, m // 3))
+    tables = kernels.table("c"), kernels.table("numpy")
+    for fit in (robust_homography, fit_homography):
+        one, two = (fit(q1, q2, w, table) for table in tables)
+        assert abs(np.sum(one[0] * two[0])) == pytest.approx(1.0, abs=1e-9)
+        for own, other in zip(one[1:], two[1:], strict=True):
+            np.testing.assert_allclose(own, other, rtol=1e-6, atol=1e-9 * np.max(other))

@@ -6,6 +6,7 @@ common factor and separate origins do not.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,9 +102,10 @@ def condition(x1: Array, x2: Array) -> Conditioning:
     Conditioning
         Origins at the centroids.
     """
-    origin1, origin2 = x1.mean(axis=0), x2.mean(axis=0)
-    squares = np.mean((x1 - origin1) ** 2) + np.mean((x2 - origin2) ** 2)
-    return Conditioning(origin1, origin2, float(np.sqrt(squares / 2.0)) / RMS)
+    m = len(x1)
+    origin1, origin2 = np.add.reduce(x1) / m, np.add.reduce(x2) / m
+    squares = sum(float(np.vdot(own, own)) for own in (x1 - origin1, x2 - origin2)) / (2 * m)
+    return Conditioning(origin1, origin2, math.sqrt(squares / 2.0) / RMS)
 
 
 def displaced(conditioning: Conditioning, F: Array) -> Conditioning:

@@ -43,6 +43,7 @@ __all__ = [
     "WEAK",
     "diagnose",
     "planar_bound",
+    "plane_flags",
     "still_bound",
 ]
 
@@ -176,7 +177,7 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     else:
         raised["undetermined"] = is_left_open(judged)
         raised["wrong calibration"] = found.from_rays is not None and is_calibration_wrong(judged)
-        for name, is_raised in _plane(judged).items():
+        for name, is_raised in plane_flags(judged).items():
             raised[name] = is_raised or raised.get(name, False)
     return ordered(name for name, is_raised in raised.items() if is_raised)
 
@@ -223,13 +224,16 @@ def still_bound(n: int, redundancy: int | None = None) -> float:
     return max(known, 2 * n * _STILL)
 
 
-def _plane(found: Evidence) -> dict[str, bool]:
-    """Return the flags about simpler models than F."""
+def plane_flags(found: Evidence, *, tested: bool = False) -> dict[str, bool]:
+    """Return which flags about simpler models than F the inliers of some evidence raise.
+
+    Where it is known that a cheap test does not tell that they are off any plane, that is left out.
+    """
     noise2 = max(found.noise, ROUNDING) ** 2
     hidden = found.noise > HIDDEN * RANGE
     everywhere = np.ones(len(found.weights), np.bool_)
     off = is_plain_relief if found.searched else lambda own: share_on_a_plane(own) < MOST_ON
-    if not hidden and off(found):
+    if not hidden and not tested and off(found):
         return {"near-affine": _is_affine(found, everywhere)}
     model = judge_plane(found, hidden=hidden)
     on, weights = model.on, found.weights[model.on]

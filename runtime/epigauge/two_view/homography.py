@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+import ctypes
+from functools import cache
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import kernels
+from epigauge._library import address, library
+from epigauge._native import check_sizes
 from epigauge.kernels import Table
 from epigauge.two_view.losses import median
 
 __all__ = ["fit_homography", "plane_squares", "robust_homography"]
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
 
 #: Iterations of the robust fit at most, and the relative change of the median square at which it
 #: stands.
 _ROUNDS = 15
 _STANDS = 1e-6
+
+#: Fits that are weighed as the one before says: converging as the noise over the size of the scene.
+_FITS = 4
 
 #: Fours of matches that it is tried from: with half of them on the plane one in sixteen is clean.
 _SAMPLES = 40
@@ -58,7 +68,9 @@ def fit_homography(
     """
     table = table or kernels.table()
     H = _EQUAL
-    for _ in range(4):  # converges as the noise over the size of the scene
+    if table.compiled:
+        return _fitted(q1, q2, weights)
+    for _ in range(_FITS):
         H, N = _least(table, H, q1, q2, weights)
     return H, table.homography_squared(H, q1, q2), N
 
@@ -91,10 +103,58 @@ def robust_homography(
         Squared distance of each match, in both images.
     """
     table = table or kernels.table()
-    starts = (weights, _near_a_sample(table, q1, q2, weights))
+    rng = np.random.default_rng(0)
+    fours = np.argpartition(rng.random((_SAMPLES, q1.shape[1])), 3, axis=1)[:, :4]
+    if table.compiled:
+        return _compiled(q1, q2, weights, fours)
+    starts = (weights, _near_a_sample(table, q1, q2, weights, fours))
     ends = [_reweighted(table, q1, q2, weights, own, _SHARP) for own in starts]
     squares = min((end[1] for end in ends), key=median)
     return _reweighted(table, q1, q2, weights, _falling(weights, squares, _WIDE), _WIDE)
+
+
+class _Options(ctypes.Structure):
+    _fields_ = (
+        ("equal", ctypes.c_double * 9),
+        *((name, ctypes.c_double) for name in ("stands", "sharp", "wide", "rounding2")),
+        ("rounds", ctypes.c_int),
+    )
+
+
+@cache
+def _functions() -> Any:
+    check_sizes({"eg_plane_options": _Options})
+    fit, robust = library().eg_fit_homography, library().eg_robust_homography
+    pointer, size = ctypes.c_void_p, ctypes.c_ssize_t
+    fit.argtypes, fit.restype = [size, *[pointer] * 3, size, *[pointer] * 3], None
+    robust.argtypes = [size, *[pointer] * 3, size, *[pointer] * 4]
+    return fit, robust
+
+
+def _fitted(q1: Array, q2: Array, weights: Array) -> tuple[Array, Array, Array]:
+    """Return what `fit_homography` does, of the C library (runtime/c/homography.c)."""
+    inputs = [np.ascontiguousarray(array, dtype=np.float64) for array in (q1, q2, weights)]
+    n = q1.shape[1]
+    H, squares, N = _EQUAL.copy(), np.empty(n), np.empty((9, 9))
+    _functions()[0](n, *map(address, inputs), _FITS, *map(address, (H, squares, N)))
+    return H, squares, N
+
+
+def _compiled(q1: Array, q2: Array, weights: Array, fours: Rows) -> tuple[Array, Array]:
+    """Return what `robust_homography` does, of the C library (runtime/c/homography.c)."""
+    equal = (ctypes.c_double * 9)(*_EQUAL.ravel().tolist())
+    options = _Options(equal, _STANDS, _SHARP, _WIDE, _ROUNDING**2, _ROUNDS)
+    n = q1.shape[1]
+    inputs = [np.ascontiguousarray(array, dtype=np.float64) for array in (q1, q2, weights)]
+    rows = np.ascontiguousarray(fours, dtype=np.intp)
+    H, squares = np.empty((3, 3)), np.empty(n)
+    done = _functions()[1](
+        *(n, *map(address, inputs), len(rows), address(rows)),
+        *(ctypes.addressof(options), address(H), address(squares)),
+    )
+    if not done:
+        raise MemoryError(f"no room for {n} matches")
+    return H, squares
 
 
 def _reweighted(
@@ -126,10 +186,8 @@ def _least(table: Table, H: Array, q1: Array, q2: Array, weights: Array) -> tupl
     return np.linalg.eigh(N)[1][:, 0].reshape(3, 3), N
 
 
-def _near_a_sample(table: Table, q1: Array, q2: Array, weights: Array) -> Array:
+def _near_a_sample(table: Table, q1: Array, q2: Array, weights: Array, four: Rows) -> Array:
     """Return weights of the matches near the homography of four of them, the best of many fours."""
-    rng = np.random.default_rng(0)
-    four = np.argsort(rng.random((_SAMPLES, q1.shape[1])), axis=1)[:, :4]
     candidates = np.linalg.svd(_equations(q1[:, four], q2[:, four]))[2][:, 8].reshape(-1, 3, 3)
     tried = [table.homography_squared(H, q1, q2) for H in candidates]
     best = min(tried, key=median)

@@ -342,7 +342,8 @@ class Remapped:
         self.inner, self._anchor = inner, anchor
         self._to1, self._to2 = to1, to2
         self._from1 = np.linalg.inv(to1)
-        self.entries = np.kron(np.linalg.inv(to2).T, self._from1.T)
+        one, two = self._from1.T, np.linalg.inv(to2).T
+        self.entries = (two[:, None, :, None] * one[None, :, None, :]).reshape(9, 9)  # Kronecker's
         self.dimension = inner.dimension
 
     def start(self, F: Array) -> Any:

@@ -17,15 +17,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge import verdicts
+from epigauge import kernels, verdicts
 from epigauge._library import address, library
 from epigauge._native import check_sizes
 from epigauge.two_view import native
 from epigauge.two_view.chance import CEILING, PAIRS, RANK, SIGNIFICANT, log10_false_alarms
 from epigauge.two_view.collinear import may_be_lines
 from epigauge.two_view.consensus import RANGE
-from epigauge.two_view.diagnostics import AFFINE, BLUNT, PIXELS, REDUNDANCY, WEAK, planar_bound
-from epigauge.two_view.evidence import WITHIN, of_median_one
+from epigauge.two_view.diagnostics import (
+    AFFINE,
+    BLUNT,
+    PIXELS,
+    REDUNDANCY,
+    WEAK,
+    planar_bound,
+    plane_flags,
+)
+from epigauge.two_view.evidence import WITHIN, Evidence, of_median_one
 from epigauge.two_view.planes import (
     BESIDE,
     FAR_OFF,
@@ -204,7 +212,7 @@ def verdict_of_raw(
     """
     x1, x2, weights = matches
     counts = weights > 0.0
-    unit = of_median_one(weights[counts])[1]
+    unit = of_median_one(weights[counts])[1] if np.any(weights != 1.0) else 1.0
     agreed = np.where(agreeing, weights / unit, 0.0)
     if np.count_nonzero(agreed) < _FREE + REDUNDANCY:
         return None, False
@@ -224,17 +232,50 @@ def verdict_of_raw(
     y1, y2 = x1[agreed > 0.0], x2[agreed > 0.0]
     if may_be_lines(y1, y2, np.array([0, len(y1)]), np.array([scale * _noise(own)]))[0]:
         return None, False
-    plain = _plain_flags(own, scale)
-    if plain is None or own.on_plane >= HALF_ON or own.places < PLENTY:
+    raised = _plain_flags(own, scale)
+    if raised is None:
         return None, False
     m, n = int(np.count_nonzero(counts)), int(own.number)
     wrong, copies = chance(), int(own.repeated)
     if log10_false_alarms(m - copies, n - copies, wrong) > SIGNIFICANT:
         return None, False
     judges = -(-n // -(-n // POOL))
-    if own.places <= PLAINLY * (judges / n) * wrong * (m - n):
-        return None, False
-    return plain, int(pair.numbers[0, 4]) > 0 and verdicts.usable(plain, "F")
+    many = max(PLENTY - 1, PLAINLY * (judges / n) * wrong * (m - n))
+    if own.on_plane >= HALF_ON or own.places <= many:  # a plane may be all that they are on
+        found = _evidence(pair, matches, own, unit, agreeing, limit_px)
+        about = {name for name, is_raised in plane_flags(found, tested=True).items() if is_raised}
+        raised = ordered(about.union({"weak geometry"}.intersection(raised)))
+    return raised, int(pair.numbers[0, 4]) > 0 and verdicts.usable(raised, "F")
+
+
+def _evidence(
+    pair: native.Pair,
+    matches: tuple[Array, Array, Array],
+    own: Facts,
+    unit: float,
+    agreeing: NDArray[np.bool_],
+    limit_px: float,
+) -> Evidence:
+    """Return the evidence that `Evidence.among` of the whole result would be."""
+    x1, x2, weights = (values[matches[2] > 0.0] for values in matches)
+    frame = pair.frame(0)
+    q1, q2 = frame.forward(x1, x2)
+    to_units1, to_units2 = frame.maps_from_pixels()
+    return Evidence(
+        table=kernels.table("c"),
+        F=pair.table[0, 55:64].reshape(3, 3),
+        all1=q1,
+        all2=q2,
+        all_weights=weights / unit,
+        unit=unit,
+        inlier=agreeing[matches[2] > 0.0],
+        limit=limit_px / frame.scale,
+        searched=True,
+        to_units1=to_units1,
+        to_units2=to_units2,
+        noise=_noise(own),
+        parameters=_FREE,
+    )
 
 
 def _facts(

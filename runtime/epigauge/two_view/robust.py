@@ -363,9 +363,9 @@ class Estimate(NamedTuple):
 
 def _cheap(refined: FundamentalResult) -> dict[str, Any]:
     """Return the fields that are there and stay as they are."""
-    later = ("flags", "success", "noise_px", "covariance", "_uncertainty")
-    names = (entry.name for entry in fields(refined))
-    return {name: vars(refined)[name] for name in names if name in vars(refined).keys() - later}
+    later = {"flags", "success", "noise_px", "covariance", "_uncertainty"}
+    names = type(refined).__dataclass_fields__.keys() - later
+    return {name: value for name, value in vars(refined).items() if name in names}
 
 
 def _rest(refined: FundamentalResult, limit_px: float | None) -> SimpleNamespace:

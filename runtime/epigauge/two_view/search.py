@@ -54,7 +54,7 @@ SCALES, _FLOOR = (0.003, 0.02, 0.1), 0.01
 
 #: Samples at most and at least, and how many times more than give one without wrong matches: seven
 #: right ones with noise are seldom good enough.
-_SAMPLES, _LEAST, _PATIENCE = 20_000, 768, 5.0
+_SAMPLES, _LEAST, _PATIENCE = 20_000, 256, 5.0
 
 #: Threes of matches that a plane is tried from, and twos off it that F is.
 _PLANES, _PAIRS = 64, 512
