@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import epigauge as eg
 import numpy as np
 import pytest
+from epigauge import kernels
 from epigauge.errors import ArgumentError
 from epigauge.two_view.essential import Calibrated, in_front
+from epigauge.two_view.essential_consensus import EssentialConsensus
 from epigauge.two_view.five_point import essential_5point
 from two_views import Array, algebraic
 
@@ -293,3 +297,34 @@ def test_raw_matches_from_five_on(m: int) -> None:
     assert "few matches" in result.flags
     with pytest.raises(eg.ArgumentError, match="4 different matches"):
         eg.estimate_essential(x1[:8], x2[:8], K)
+
+
+def test_climbing_goes_on_within_an_extent() -> None:
+    """Scores of another extent are not comparable: a climb that mixes them stands still."""
+    rng = np.random.default_rng(4)
+    X = np.column_stack([rng.uniform(-1.0, 1.0, (300, 2)), rng.uniform(3.0, 6.0, 300)])
+    R, t = rotation([0.1, -0.05, 0.2]), np.array([0.5, 0.1, 0.2])
+    q1, q2 = (
+        np.ascontiguousarray(pixels(np.eye(3), Y).T) + 0.001 * rng.standard_normal((2, 300))
+        for Y in (X, X @ R.T + t)
+    )
+    q2[:, ::3] = rng.uniform(-0.5, 0.5, (2, 100))
+    search = EssentialConsensus(kernels.table(), q1, q2, np.eye(3), np.eye(3))
+    near = rotation([0.01, 0.0, 0.0]) @ R
+    start = search.judge(np.cross(np.eye(3), -t) @ near, 0.003, extent=0.06)
+    end = search.climb(start)
+    assert end.extent == start.extent
+    assert end.score > start.score + 100.0
+    assert 0.0008 < end.sigma < 0.0012 < 0.002 < start.sigma
+
+
+def test_sharp_agreement_counts_beside_repeated_structure(data_dir: Path) -> None:
+    """Windows of a facade agree bluntly with an E of their own, which is the likelier one."""
+    with np.load(data_dir / "strecha_pairs" / "entry_p10.npz") as z:
+        for k in (7, 37):
+            rows = slice(z["offsets"][k], z["offsets"][k + 1])
+            x1, x2 = (z[name][rows].astype(float) for name in ("x1", "x2"))
+            found = eg.estimate_essential(x1, x2, z["K1"][k], z["K2"][k])
+            assert found.success
+            assert degrees(found.t, z["t"][k]) < 0.5
+            assert np.degrees(np.linalg.norm(found.R - z["R"][k])) < 0.5

@@ -200,7 +200,8 @@ class Consensus:
         for _ in range(_CLIMBS):
             squared = np.where(best.oriented, best.signed, 0.0) ** 2
             right = np.where(best.oriented, best.mixture(squared)[1], 0.0)
-            trial = self.judge(self.fitted(best.F, right), best.sigma, best.share)
+            F = self.fitted(best.F, right)
+            trial = self.judge(F, best.sigma, best.share, best.extent)
             if not trial.score > best.score + _CLIMBED:
                 break
             best = trial

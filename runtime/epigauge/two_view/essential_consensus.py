@@ -13,6 +13,7 @@ from epigauge.two_view.consensus import RANGE, Agreement, Consensus
 from epigauge.two_view.essential import Calibrated, Essential
 from epigauge.two_view.five_point import essential_starts
 from epigauge.two_view.parameterizations import Remapped
+from epigauge.two_view.search import FLOOR, SCALES
 
 __all__ = ["EssentialConsensus"]
 
@@ -79,10 +80,10 @@ class EssentialConsensus(Consensus):
         ranked = sorted(starts, key=lambda start: -start.score)[:_POOLS]
         pools = [(start, start.inliers(3.0 * start.sigma)) for start in ranked]
         pools.append((ranked[0], np.ones(self.cameras.q1.shape[1], dtype=np.bool_)))
-        best = max((a for pool in pools for a in self._from(*pool)), key=lambda a: a.score)
+        best = max((a for pool in pools for a in self._from(*pool)), key=_worth)
         for _ in range(_ROUNDS):
-            found = max(self._from(best, best.inliers(3.0 * best.sigma)), key=lambda a: a.score)
-            if found.score <= best.score + _CLIMBED:
+            found = max(self._from(best, best.inliers(3.0 * best.sigma)), key=_worth)
+            if _worth(found) <= _worth(best) + _CLIMBED:
                 break
             best = found
         return best
@@ -95,9 +96,22 @@ class EssentialConsensus(Consensus):
             some = self.cameras.some(pool)
             candidates = essential_starts(some, np.ones(some.q1.shape[1]), _EACH, robust=True)
             begun += [self.judge(F, start.sigma, start.share, start.extent) for F in candidates]
-        begun.sort(key=lambda agreement: -agreement.score)
+        begun.sort(key=lambda agreement: -_worth(agreement))
         return [self.climb(agreement) for agreement in begun[:_CLIMBERS]]
 
     def nearest(self, F: Array) -> Array:
         """Return the essential matrix nearest to an F, in the coordinates of the matches."""
         return self.chart.fundamental(self.chart.start(F))
+
+
+def _worth(found: Agreement) -> float:
+    """Return what agreements of one extent are compared by.
+
+    Where F is sharp, that is how sharply the matches agree, as in the search for F. The likelihood
+    of all noises prefers an E of repeated structure that many agree with bluntly.
+    """
+    if found.extent >= RANGE:
+        return found.score
+    scale2 = SCALES[0] ** 2
+    squared = found.signed[found.oriented] ** 2
+    return float(np.sum(np.log1p(scale2 / (squared + FLOOR * scale2))))

@@ -43,14 +43,14 @@ from epigauge.two_view.eliminated import EliminatedProblem
 from epigauge.two_view.losses import Loss, median
 from epigauge.two_view.parameterizations import Ortho
 
-__all__ = ["SCALES", "Found", "search"]
+__all__ = ["FLOOR", "SCALES", "Found", "search"]
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 #: Scale of the distances in conditioned coordinates, whose range is about 7: a seventh of a pixel
 #: in an image of 1000. And the part of its square that is rounding.
-SCALES, _FLOOR = (0.003, 0.02, 0.1), 0.01
+SCALES, FLOOR = (0.003, 0.02, 0.1), 0.01
 
 #: Samples at most and at least, and how many times more than give one without wrong matches: seven
 #: right ones with noise are seldom good enough.
@@ -158,7 +158,7 @@ def search(
         return _Search(kernels, q, order, seed, scale).run()
     width = (ctypes.c_double * 4)(*_WIDTHS)
     numbers = (seed, _SAMPLES, _LEAST, _PLANES, _PAIRS, _STEPS, len(_WIDTHS))
-    options = _Options(*numbers, scale, _FLOOR, _PATIENCE, width, _DOMINANT)
+    options = _Options(*numbers, scale, FLOOR, _PATIENCE, width, _DOMINANT)
     order = None if order is None else np.ascontiguousarray(order, dtype=np.intp)
     F, score = np.zeros((3, 3)), np.zeros(1)
     samples = _function()(
@@ -211,13 +211,13 @@ class _Search:
         if self.on is None:
             return self.agreement(F, self.q)
         sharp, blunt = self.q[:, ~self.on], self.q[:, self.on]
-        luck = max((_LUCK * self.noise / self.scale) ** 2, _FLOOR)
+        luck = max((_LUCK * self.noise / self.scale) ** 2, FLOOR)
         return self.agreement(F, sharp, self.scale, luck) + self.agreement(
             F, blunt, _BLUNT * self.noise, 1.0
         )
 
     def agreement(
-        self, F: Array, q: Array, scale: float | None = None, floor: float = _FLOOR
+        self, F: Array, q: Array, scale: float | None = None, floor: float = FLOOR
     ) -> Array:
         """Return the scores of many F, shape (k, 3, 3)."""
         scale2 = (self.scale if scale is None else scale) ** 2
@@ -345,7 +345,7 @@ class _Search:
             return
         distances = self.distances(self.F)
         near = distances <= (3.0 * self.scale) ** 2
-        noise2 = max(1.4826**2 * median(distances[near]), _FLOOR * self.scale**2)
+        noise2 = max(1.4826**2 * median(distances[near]), FLOOR * self.scale**2)
         on = squared <= _OFF**2 * noise2
         if np.count_nonzero(~on[near]) <= _DEGENERATE * np.count_nonzero(near):
             self.on, self.noise = on, noise2**0.5
