@@ -189,18 +189,24 @@ def prepare(run: Runner) -> list[str]:
 
     problems = run("samples", ".").check(0)
     colmap_databases.Project().write(Path("database.db"))
-    tracks = eg.load_tracks("tracks.csv")
+    tracks = from_the_corner()
     clean = np.arange(len(tracks)) % 50 != 0
-    # Those of the sample are from the centre of the images.
-    eg.save_tracks(
-        "corner.csv", eg.Tracks(tracks.view, tracks.point, tracks.xy + np.array([320.0, 240.0]))
-    )
     parts = {"view": tracks.view, "point": tracks.point, "xy": tracks.xy}
     np.savez("marked.npz", **parts, clean=clean)
     matches = eg.load_matches("matches.csv")
     marks = np.arange(len(matches)) % 10 != 0
     np.savez("marked_matches.npz", x1=matches.x1, x2=matches.x2, inlier=marks)
     return problems
+
+
+def from_the_corner() -> Any:
+    """Write corner.csv, the tracks of the sample counted from a corner; return the sample."""
+    import epigauge as eg
+
+    tracks = eg.load_tracks("tracks.csv")
+    moved = tracks.xy + np.array([320.0, 240.0])  # those of the sample are from the middle
+    eg.save_tracks("corner.csv", eg.Tracks(tracks.view, tracks.point, moved))
+    return tracks
 
 
 def help_of(command: Command | None, run: Runner) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import io
 import json
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -86,6 +87,25 @@ def test_a_scene_of_any_form_is_read_from_stdin(name: str) -> None:
         assert done.check(0) == []
         rms.append(json.loads(done.out)["rms_px"])
     assert rms[0] == rms[1]
+
+
+@pytest.mark.parametrize("name", ["refine", "estimate", "bundle", "metric", "compare"])
+def test_what_stdin_holds_is_called_stdin(name: str) -> None:
+    """In errors, tables, JSON and pages: no name of the copy that is read."""
+    commands.from_the_corner()
+    words = [*commands.commands()[name].words(), *(["--methods", "free"] * (name == "compare"))]
+    content = Path(words[1]).read_bytes()
+    words[1] = "-"
+    damaged = commands.in_process(*words, stdin=content + b"no,numbers,at,all\n")
+    assert damaged.check(2) == []
+    assert damaged.err.startswith("epigauge: stdin, line ")
+    copies = str(Path(tempfile.gettempdir(), "epigauge-"))
+    for more in ("--json",), ("--plot", "stdin.html"):
+        done = commands.in_process(*words, *more, stdin=content)
+        assert done.check(0, 1) == []
+        page = Path("stdin.html").read_text(encoding="utf-8") if "--plot" in more else ""
+        assert copies not in done.err + done.out.decode() + page
+        assert "epigauge-" not in page.partition("</title>")[0]
 
 
 def test_starts_and_lines_are_read_from_stdin_too() -> None:

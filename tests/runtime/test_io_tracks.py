@@ -20,7 +20,10 @@ from tests.metric_scenes import metric_scene
 
 SCENE = eg.multi_view_scene(n_views=4, n_points=12, visible=0.7, seed=2)
 TRACKS = SCENE.tracks
-BAL_START = eg.Reconstruction(np.diag([-1.0, -1.0, 1.0]) @ SCENE.true.P, SCENE.true.Q)
+#: In the other coordinates everything is behind cameras of BAL, which look along -z.
+BEHIND = eg.Reconstruction(np.diag([-1.0, -1.0, 1.0]) @ SCENE.true.P, SCENE.true.Q)
+MIRROR = np.array([-1.0, -1.0, -1.0, 1.0])
+BAL_START = eg.Reconstruction(BEHIND.P * MIRROR, BEHIND.Q * MIRROR)
 SUFFIXES = [".npz", ".csv", ".txt", ".txt.bz2", ".txt.gz"]
 NEED_START = SUFFIXES[2:]
 
@@ -74,7 +77,26 @@ def test_bal_keeps_the_geometry_of_its_cameras(tmp_path, suffix, scale) -> None:
     eg.save_tracks(tmp_path / f"t{suffix}", TRACKS, start)
     found = eg.load_reconstruction(tmp_path / f"t{suffix}")
     np.testing.assert_allclose(found.project(TRACKS), start.project(TRACKS), atol=1e-9)
-    np.testing.assert_allclose(found.Q, SCENE.true.Q, atol=1e-15)
+    np.testing.assert_allclose(found.Q, BAL_START.Q, atol=1e-15)
+
+
+@pytest.mark.parametrize("start", [BAL_START, BEHIND], ids=["before", "behind"])
+def test_bal_puts_the_scene_before_its_cameras(tmp_path, start) -> None:
+    eg.save_tracks(tmp_path / "t.txt", TRACKS, start)
+    found = eg.load_reconstruction(tmp_path / "t.txt")
+    np.testing.assert_allclose(found.project(TRACKS), start.project(TRACKS), atol=1e-9)
+    tracks, scene = eg.load_scene(tmp_path / "t.txt")
+    seen = np.einsum("nij,nj->ni", scene.R[tracks.view], scene.X[tracks.point])
+    assert (seen[:, 2] + scene.t[tracks.view, 2] < 0.0).all()  # they look along -z
+
+
+def test_bal_refuses_a_camera_that_looks_away_from_its_points(tmp_path) -> None:
+    P = BAL_START.P.copy()
+    P[2] = np.diag([-1.0, 1.0, -1.0]) @ P[2]  # half a turn about the x axis
+    P[2, :2] *= -1.0
+    with pytest.raises(ArgumentError, match="camera 2 with its points behind it"):
+        eg.save_tracks(tmp_path / "t.txt", TRACKS, eg.Reconstruction(P, BAL_START.Q))
+    assert not (tmp_path / "t.txt").exists()
 
 
 def test_bal_rotations_near_and_at_half_a_turn_come_back(tmp_path) -> None:
@@ -82,8 +104,8 @@ def test_bal_rotations_near_and_at_half_a_turn_come_back(tmp_path) -> None:
         c, s = np.cos(angle), np.sin(angle)
         R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
         P = BAL_START.P.copy()
-        P[0] = np.diag([-900.0, -900.0, 1.0]) @ np.column_stack([R, [1.0, 2.0, 40.0]])
-        eg.save_tracks(tmp_path / "t.txt", TRACKS, eg.Reconstruction(P, SCENE.true.Q))
+        P[0] = np.diag([-900.0, -900.0, 1.0]) @ np.column_stack([R, [1.0, 2.0, -40.0]])
+        eg.save_tracks(tmp_path / "t.txt", TRACKS, eg.Reconstruction(P, BAL_START.Q))
         found = eg.load_reconstruction(tmp_path / "t.txt").P[0]
         np.testing.assert_allclose(found, P[0], atol=1e-9)  # entries up to 4e4
 

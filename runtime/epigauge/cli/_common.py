@@ -46,6 +46,8 @@ _BAL = re.compile(rb"\s*\d+[ \t]+\d+[ \t]+\d+[ \t]*\r?\n")
 
 #: Whether people are told nothing but errors.
 _quiet: ContextVar[bool] = ContextVar("quiet", default=False)
+#: Copies of what stdin held, which nobody should hear of.
+_copies: list[Path] = []
 #: Name of the command that runs.
 _running: ContextVar[str] = ContextVar("command", default="")
 
@@ -116,6 +118,7 @@ def given(path: Path) -> Path:
     form = next((form for form, start in _STARTS.items() if content.startswith(start)), form)
     copied = Path(folder, f"stdin{form}")
     copied.write_bytes(content)
+    _copies.append(copied)
     return copied
 
 
@@ -146,17 +149,25 @@ def warn(out: Console, result: eg.FundamentalResult) -> None:
         out.print(f"[bold red]not converged:[/] {escape(result.message)}", soft_wrap=True)
 
 
+def told(path: Path) -> str:
+    """Return what to call a file that was read: its path, or stdin for the copy of that."""
+    return "stdin" if path in _copies else str(path)
+
+
 def shown(path: Path) -> str:
     """Return a path as the caller wrote it, without what a terminal would interpret."""
-    return "".join(c if c.isprintable() else "?" for c in str(path))
+    return "".join(c if c.isprintable() else "?" for c in told(path))
 
 
 def named(path: Path) -> str:
     """Return what to call a file in a title: its name and that of its directory."""
-    return shown(Path(*path.parts[-2:]))
+    return shown(path if path in _copies else Path(*path.parts[-2:]))
 
 
 def _one_line(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{os.fspath(error.filename)}: {error.strerror}"
-    return " ".join(str(error).split())
+    text = " ".join(str(error).split())
+    for copied in _copies:
+        text = text.replace(str(copied), "stdin")
+    return text

@@ -26,6 +26,7 @@ from epigauge.cli._common import (
     facts,
     named,
     shown,
+    told,
     write_json,
 )
 from epigauge.cli._live import watching
@@ -278,7 +279,7 @@ class _SceneAnswer:
         """Return what neither result nor scene holds."""
         tracks, lines = self.job.tracks, self.job.lines
         known = {
-            "source": str(self.job.path),
+            "source": told(self.job.path),
             "n_views": tracks.n_views,
             "n_points": tracks.n_points,
             "seconds": self.seconds,

@@ -37,6 +37,7 @@ from epigauge.cli._common import (
     given,
     named,
     shown,
+    told,
     write_json,
 )
 from epigauge.cli._live import watching
@@ -343,7 +344,7 @@ class _Answer:
     def more(self) -> dict[str, Any]:
         """Return what the result does not hold."""
         return {
-            "source": str(self.source),
+            "source": told(self.source),
             "n_views": self.file.tracks.n_views,
             "n_points": self.file.tracks.n_points,
             "view_numbers": self.file.views,

@@ -22,6 +22,7 @@ from epigauge.cli._common import (
     given,
     named,
     shown,
+    told,
     write_json,
 )
 from epigauge.cli._live import watching
@@ -100,12 +101,12 @@ def compare(
             observed.tracks, chosen, first, on_method=watch.begin, callback=watch, **options
         )
     title = named(tracks)
-    targets.save(lambda path: comparison.save(path, source=str(tracks)))
+    targets.save(lambda path: comparison.save(path, source=told(tracks)))
     targets.draw(lambda path: save_drawing(path, comparison.plot(title), title, comparison))
     if json:
         write_json(
             {
-                "source": str(tracks),
+                "source": told(tracks),
                 "start_rms_px": comparison.start_rms_px,
                 "rows": comparison.rows,
             }

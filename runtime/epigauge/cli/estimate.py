@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 from epigauge._options import Backend, FrontEnd
-from epigauge.cli._common import Json, choice, given, shown
+from epigauge.cli._common import Json, choice, given, shown, told
 from epigauge.cli._models import Intrinsics, Model, check_model, finish_plane, look_for
 from epigauge.cli._targets import ImageSize, Plot, Targets, outputs
 from epigauge.cli.refine import FROM_FILE, finish, of_size, warn_of_marks
@@ -82,7 +82,7 @@ def estimate(
         raise
     seconds = time.perf_counter() - begin
     more: dict[str, Any] = {
-        "source": str(matches),
+        "source": told(matches),
         "matches": len(pair),
         "noise_estimated": noise_px is None,
         "seconds": seconds,

@@ -23,6 +23,7 @@ from epigauge.cli._common import (
     given,
     named,
     shown,
+    told,
     write_json,
 )
 from epigauge.cli._scenes import save_cloud
@@ -131,7 +132,7 @@ class _Answer:
         """Return everything as plain data."""
         result = self.result
         document: dict[str, Any] = {
-            "source": str(self.source),
+            "source": told(self.source),
             "n_views": self.tracks.n_views,
             "n_points": self.tracks.n_points,
             "n_observations": len(self.tracks),
@@ -161,7 +162,7 @@ class _Answer:
                 save_cloud(path, scene.X, scene.centres, note, tracks.colours)
             case ".npz":
                 focal, std = self.focal
-                more = {"focal_px": focal, "focal_std_px": std, "source": str(self.source)}
+                more = {"focal_px": focal, "focal_std_px": std, "source": told(self.source)}
                 write_npz_scene(path, tracks, scene, more)
             case _:
                 save_scene(path, tracks, scene)

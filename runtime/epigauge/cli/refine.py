@@ -24,6 +24,7 @@ from epigauge.cli._common import (
     facts,
     given,
     shown,
+    told,
     warn,
     write_json,
 )
@@ -98,7 +99,7 @@ def refine(
         raise
     seconds = time.perf_counter() - begin
     rows = {"matches": str(len(pair))}
-    more = {"source": str(matches), "matches": len(pair), "noise_estimated": noise_px is None}
+    more = {"source": told(matches), "matches": len(pair), "noise_estimated": noise_px is None}
     used = np.arange(len(pair))
     return finish(result, pair, used, more | {"seconds": seconds}, rows, targets, json)
 

@@ -105,13 +105,18 @@ def projective_cameras(cameras: Array) -> Array:
     return np.asarray(P)
 
 
-def nine_numbers(reconstruction: Reconstruction) -> tuple[Array, Array]:
+def nine_numbers(reconstruction: Reconstruction, tracks: Tracks) -> tuple[Array, Array]:
     """Return what BAL holds of projective cameras and points.
+
+    BAL's cameras look along -z. To a projective camera the point X and the point -X seen from -t
+    are the same; of the two scenes the one before its cameras is returned.
 
     Parameters
     ----------
     reconstruction : Reconstruction
         Its cameras must be diag(-f, -f, 1) (R | t) up to scale, its points finite.
+    tracks : Tracks
+        Says which camera sees which point.
 
     Returns
     -------
@@ -121,13 +126,24 @@ def nine_numbers(reconstruction: Reconstruction) -> tuple[Array, Array]:
     Raises
     ------
     ArgumentError
-        Naming the first camera or point that is not.
+        Naming the first camera or point that is not, or the first camera that has its points
+        behind it where most others have them in front.
     """
     at_infinity = np.flatnonzero(reconstruction.Q[:, 3] == 0.0)
     if len(at_infinity):
         raise ArgumentError("start", f"has point {at_infinity[0]} at infinity", "finite points")
-    cameras = [_nine_numbers(i, P) for i, P in enumerate(reconstruction.P)]
-    return np.array(cameras), reconstruction.Q[:, :3] / reconstruction.Q[:, 3:]
+    cameras = np.array([_nine_numbers(i, P) for i, P in enumerate(reconstruction.P)])
+    points = reconstruction.Q[:, :3] / reconstruction.Q[:, 3:]
+    axes = from_rodrigues(cameras[:, :3])[:, 2]
+    depth = (axes[tracks.view] * points[tracks.point]).sum(axis=1) + cameras[tracks.view, 5]
+    behind = depth > 0.0
+    if 2 * np.count_nonzero(behind) > len(behind):
+        cameras[:, 3:6], points, behind = -cameras[:, 3:6], -points, depth < 0.0
+    lost = np.bincount(tracks.view, behind, len(cameras)) > 0.5 * np.bincount(tracks.view)
+    if lost.any():
+        was = f"has camera {np.flatnonzero(lost)[0]} with its points behind it, unlike most others"
+        raise ArgumentError("start", was, "a scene before its cameras; NPZ holds every camera")
+    return cameras, points
 
 
 def _numbers(

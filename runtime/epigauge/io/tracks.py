@@ -278,7 +278,9 @@ def save_tracks(path: PathLike, tracks: Tracks, start: Reconstruction | None = N
         What to write.
     start : Reconstruction, optional
         Cameras and points to write too. BAL needs them, and in its own form: cameras
-        diag(-f, -f, 1) (R | t) up to scale and no point at infinity. CSV has no place for them.
+        diag(-f, -f, 1) (R | t) up to scale, all before or all behind their points, and no point at
+        infinity; a scene behind its cameras is written as the one before them that has the same
+        images, -X seen from -t. CSV has no place for them.
 
     Raises
     ------
@@ -310,7 +312,7 @@ def save_tracks(path: PathLike, tracks: Tracks, start: Reconstruction | None = N
         else:
             assert start is not None
             with compressing(file, form) as stream:
-                write_bal(stream, tracks, *nine_numbers(start))
+                write_bal(stream, tracks, *nine_numbers(start, tracks))
 
 
 def save_reconstruction(path: PathLike, reconstruction: Reconstruction) -> None:

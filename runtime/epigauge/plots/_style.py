@@ -90,8 +90,6 @@ def write_figure(figure: Figure, file: IO[bytes], form: str) -> None:
 
 def draw_history(axes: Axes, history: Sequence[Row]) -> None:
     """Draw the cost of each evaluation, less the lowest, accepted and rejected steps apart."""
-    from matplotlib.ticker import MaxNLocator
-
     cost = np.array([row.cost for row in history], dtype=np.float64)
     accepted = np.array([row.accepted for row in history], dtype=np.bool_)
     accepted[:1] = True  # the start
@@ -114,9 +112,18 @@ def draw_history(axes: Axes, history: Sequence[Row]) -> None:
         cross = {"ls": "", "marker": "x", "color": RED, "ms": 7, "mew": 1.8}
         axes.plot(at[rejected], drawn[rejected], label="rejected", **cross)  # type: ignore[arg-type]
     axes.set_yscale("log")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    count_whole(axes, "x")
     axes.set(xlabel="evaluation", ylabel="cost above the lowest (px\N{SUPERSCRIPT TWO})")
     finish(axes, "Convergence")
+
+
+def count_whole(axes: Axes, which: str = "y") -> None:
+    """Let the ticks of axes on which things are counted, x, y or both, be whole numbers."""
+    from matplotlib.ticker import MaxNLocator
+
+    for axis in which:
+        ticks = MaxNLocator("auto", steps=[1, 2, 5, 10], integer=True, min_n_ticks=1)
+        getattr(axes, f"{axis}axis").set_major_locator(ticks)
 
 
 def finish(axes: Axes, title: str, legend: bool = True, place: Any = "best") -> None:
@@ -126,6 +133,6 @@ def finish(axes: Axes, title: str, legend: bool = True, place: Any = "best") -> 
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color("0.6")
-    axes.tick_params(labelsize=8, color=GREY)
+    axes.tick_params(which="both", labelsize=8, color=GREY)
     if legend:
         axes.legend(fontsize=9, frameon=False, loc=place)

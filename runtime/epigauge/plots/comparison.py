@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.bundle.strategies import STRATEGIES
-from epigauge.plots._style import GREY, RED, finish, heading, new_figure
+from epigauge.plots._style import GREY, RED, count_whole, finish, heading, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -70,8 +70,6 @@ def plot_comparison(comparison: Comparison, title: str = "") -> Figure:
     >>> plot_comparison(eg.compare(tracks))  # doctest: +SKIP
     """
     figure = new_figure(_WIDTH, 5.6)
-    from matplotlib.ticker import MaxNLocator
-
     heading(figure, "Convergence of the methods" + (f": {title}" if title else ""))
     axes, table = figure.subplots(1, 2, width_ratios=(1.4, 1.0))
     best = min((row.cost for row in comparison.rows if np.isfinite(row.cost)), default=0.0)
@@ -83,15 +81,18 @@ def plot_comparison(comparison: Comparison, title: str = "") -> Figure:
     axes.axhline(floor, color=GREY, lw=0.8, ls=":")
     axes.annotate(
         "no difference: 10\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT NINE} of the best cost",
-        *((0.0, floor), (4, 4)),  # every curve comes down from the left and leaves this corner
+        *((0.0, floor), (4, -3)),  # no curve goes below
         xycoords=("axes fraction", "data"),
         textcoords="offset points",
+        va="top",
         fontsize=8,
         color=GREY,
     )
     axes.set(yscale="log", xlabel="evaluations of the cost")
+    highest = max(float(curve[np.isfinite(curve)].max(initial=floor)) for curve in curves)
+    axes.set_ylim(bottom=floor * (floor / highest) ** 0.08 / 1.2)
     axes.set(ylabel=f"lowest cost so far, above the best ({_SQUARED_PX})")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    count_whole(axes, "x")
     slowest = max(row.nfev for row in comparison.rows)
     if slowest > 30:
         ticks = [tick for tick in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000) if tick <= slowest]
@@ -160,7 +161,7 @@ def _draw_table(axes: Axes, rows: list[ComparedMethod]) -> None:
     """Draw a row a method: its line, its name, evaluations, seconds and RMS."""
     axes.axis("off")
     axes.set(xlim=(0.0, 1.0), ylim=(max(len(rows), 8) + 0.8, -1.0))
-    right = (0.6, 0.77, 1.0)
+    right = (0.64, 0.79, 1.0)
     for x, name in zip(right, ("evals", "seconds", "RMS px"), strict=True):
         axes.text(x, -0.35, name, ha="right", va="center", fontsize=9, color=GREY)
     axes.text(0.13, -0.35, "method", va="center", fontsize=9, color=GREY)

@@ -105,7 +105,10 @@ def _draw_scene(axes: Axes, shown: Display, side: Array, ends: Array, floor: boo
     """
     points = shown.points[shown.shown]
     rims = _rims(shown)
-    low, high = np.quantile(points, (_STRAY, 1.0 - _STRAY), axis=0) if len(points) else (0.0, 0.0)
+    # Of few points none is left out.
+    low, high = np.full(3, -np.inf), np.full(3, np.inf)
+    if len(points) > 2.0 / _STRAY:
+        low, high = np.quantile(points, (_STRAY, 1.0 - _STRAY), axis=0)
     near = points[((points >= low) & (points <= high)).all(axis=1)]
     framed = np.vstack([near, shown.centres, rims.reshape(-1, 3)])
     middle = (framed.min(axis=0) + framed.max(axis=0)) / 2.0

@@ -160,5 +160,6 @@ def _draw_image(
         found.reshape(counts[1], counts[0]), norm=norm, cmap="viridis", extent=extent
     )
     axes.set_title("In the images", loc="left", fontsize=11)
+    axes.set(xlabel="x (px)", ylabel="y (px)")
     axes.tick_params(labelsize=8)
     return image

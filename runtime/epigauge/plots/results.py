@@ -23,7 +23,7 @@ from epigauge.multi_view.line_tracks import LineTracks
 from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.tracks import Tracks
 from epigauge.multi_view.uncertainty import ReconstructionCovariance
-from epigauge.plots._style import BLUE, GREY, RED, finish, heading, new_figure
+from epigauge.plots._style import BLUE, GREY, RED, count_whole, finish, heading, new_figure
 from epigauge.plots.many_views import plot_bundle
 from epigauge.plots.precision import plot_precision
 from epigauge.two_view.batch import FundamentalBatch
@@ -89,10 +89,12 @@ def _(result: Tracks) -> Figure:
     counts = np.bincount(result.view, minlength=result.n_views)
     views.bar(np.arange(result.n_views), counts, color=BLUE, width=0.8)
     views.set(xlabel="view", ylabel="observations")
+    count_whole(views, "xy")
     finish(views, "Observations of each view", legend=False)
     seen = np.bincount(np.bincount(result.point, minlength=result.n_points))
     lengths.bar(np.arange(len(seen)), seen, color=BLUE, width=0.8)
     lengths.set(xlabel="views that see a point", ylabel="points")
+    count_whole(lengths, "xy")
     finish(lengths, "Lengths of the tracks", legend=False)
     return figure
 
@@ -100,7 +102,8 @@ def _(result: Tracks) -> Figure:
 @plot_result.register(Matches)
 def _(result: Matches) -> Figure:
     """Draw where the points of image 1 went."""
-    return _moves(result.x1, result.x2, None, f"{result.name}: {len(result)} matches")
+    title = f"{result.name}: " if result.name else ""
+    return _moves(result.x1, result.x2, None, f"{title}{len(result)} matches")
 
 
 @plot_result.register(LineTracks)
@@ -250,6 +253,8 @@ def _moves(
             arrows.quiver(*a.T, *(b - a).T, color=colour, width=0.003, label=label, **look)
     both = np.vstack([x1, x2])
     low, high = both.min(axis=0), both.max(axis=0)
+    room = np.maximum(0.04 * (high - low), 1.0)
+    low, high = low - room, high + room
     arrows.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), xlabel="x (px)", ylabel="y (px)")
     arrows.set_aspect("equal", adjustable="box")
     arrows.set_anchor("N")
@@ -265,7 +270,10 @@ def _moves(
         lengths.set(xticks=[], yticks=[])
         lengths.text(0.5, 0.5, "none", color=GREY, ha="center", transform=lengths.transAxes)
     lengths.set(xlabel=name, ylabel="matches")
-    finish(lengths, "Lengths of those that agree", legend=False)
+    count_whole(lengths)
+    finish(
+        lengths, "Lengths of those that agree" if inlier is not None else "Lengths", legend=False
+    )
     return figure
 
 
@@ -308,6 +316,7 @@ def _sorted(values: Mapping[str, Array], title: str) -> Figure:
         if len(rising):
             axes.set_yscale("log")
         note = f", {left} more are 0 or open" if left else ""
+        count_whole(axes, "x")
         axes.set_xlabel(f"{len(rising)} values in rising order{note}", color=GREY)
         finish(axes, name, legend=False)
     return figure

@@ -10,7 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from epigauge._arguments import as_matches
 from epigauge.errors import ArgumentError
-from epigauge.plots._style import BLUE, GREY, RED, draw_history, finish, heading, new_figure
+from epigauge.plots._style import (
+    BLUE,
+    GREY,
+    RED,
+    count_whole,
+    draw_history,
+    finish,
+    heading,
+    new_figure,
+)
 from epigauge.two_view.geometry import reprojection_distances
 from epigauge.two_view.result import FundamentalResult
 
@@ -91,6 +100,9 @@ def plot_refinement(
         lines = _homogeneous(feet[1 - view][chosen]) @ matrix.T
         _draw_view(axes, points[view], feet[view], chosen, lines, boxes[view], photos[view])
         _draw_epipole(axes, _null_vector(matrix.T), boxes[view], view + 1)
+    shades = "Of the same colour: a match and its epipolar lines. "
+    others = "Small dots: the other matches"
+    figure.supxlabel(shades + others, x=0.01, ha="left", fontsize=8.5, color=GREY)
     _draw_distances(figure.add_subplot(grid[1, 0]), d)
     draw_history(figure.add_subplot(grid[1, 1]), result.history)
     return figure
@@ -164,6 +176,7 @@ def _draw_distances(axes: Axes, d: Array) -> None:
     if beyond:
         axes.plot([], [], " ", label=f"{beyond} farther away")
     axes.set(xlabel="signed distance to the epipolar geometry (px)", ylabel="matches")
+    count_whole(axes)
     finish(axes, "Residuals")
 
 
