@@ -1,6 +1,6 @@
 """Metric upgrades: motions that leave intrinsics open, and measured tracks with known cameras.
 
-    python benchmarks/metric_upgrade.py [--trials 50]
+    python benchmarks/metric_upgrade.py [--trials 50] [--motions axis point]
     python benchmarks/metric_upgrade.py --lenses [--trials 50]
     python benchmarks/metric_upgrade.py --data FOLDER [--parts]
 
@@ -33,10 +33,10 @@ NAMED = {
 }
 
 
-def simulated(trials: int) -> None:
+def simulated(trials: int, motions: list[str]) -> None:
     """Print a line a motion."""
     print("motion        trials  flagged  named  success  rms (f - f0) / sigma   flags")
-    for motion in MOTIONS:
+    for motion in motions:
         flags: collections.Counter[str] = collections.Counter()
         ratios, flagged, named, good = [], 0, 0, 0
         for seed in range(trials):
@@ -48,12 +48,17 @@ def simulated(trials: int) -> None:
             flags.update(found.flags)
             flagged += bool(found.flags)
             named += NAMED.get(motion, "") in found.flags
+            if motion in NAMED and NAMED[motion] not in found.flags:
+                print(
+                    f"  {motion} of seed {seed}, {options}, {noise} px: {found.flags}", flush=True
+                )
             good += found.success
             if found.success:
                 ratios.append((found.focal_px - 900.0) / found.focal_std_px)
         spread = np.sqrt(np.mean(np.square(ratios))) if ratios else float("nan")
         words = ", ".join(f"{name} {count}" for name, count in flags.most_common())
-        print(f"{motion:12} {trials:7} {flagged:8} {named:6} {good:8} {spread:12.2f}   {words}")
+        counts = f"{trials:7} {flagged:8} {named:6} {good:8}"
+        print(f"{motion:12} {counts} {spread:12.2f}   {words}", flush=True)
 
 
 def simulated_lenses(trials: int) -> None:
@@ -189,6 +194,7 @@ def row(name: str, tracks: eg.Tracks, size: np.ndarray, true: float) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--trials", type=int, default=50)
+    parser.add_argument("--motions", nargs="+", choices=MOTIONS, default=list(MOTIONS))
     parser.add_argument("--data", type=Path)
     parser.add_argument("--parts", action="store_true")
     parser.add_argument("--lenses", action="store_true")
@@ -198,4 +204,4 @@ if __name__ == "__main__":
     elif options.lenses:
         simulated_lenses(options.trials)
     else:
-        simulated(options.trials)
+        simulated(options.trials, options.motions)

@@ -284,8 +284,8 @@ class _Answer:
         for name, why in self.source.left_out.items():
             out.print(f"[bold]left out:[/] {escape(name)} {escape(why)}", soft_wrap=True)
         if not result.success:
-            told = [f"the photographs {_WHY[name]}" for name in result.flags if name in _WHY]
-            reason = told[0] if told else result.message
+            reasons = [f"the photographs {_WHY[name]}" for name in result.flags if name in _WHY]
+            reason = reasons[0] if reasons else result.message
             out.print(f"[bold red]no scene:[/] {escape(reason)}", soft_wrap=True)
 
     def write(self, output: Path) -> None:
