@@ -300,3 +300,13 @@ def test_a_poster_is_flat_through_any_lens(depth: float, flat: bool) -> None:
     assert _focal_error(found) < 0.01
     assert ("planar scene" in found.flags) == flat
     assert found.success != flat
+
+
+@pytest.mark.parametrize(("seed", "n_points", "noise"), [(1027, 157, 0.2), (1035, 107, 1.0)])
+def test_four_views_of_a_camera_that_turned_are_named(
+    seed: int, n_points: int, noise: float
+) -> None:
+    tracks, _ = tracks_of("rotation", seed, n_views=4, n_points=n_points, noise_px=noise)
+    found = eg.metric_upgrade(tracks, image_size=SIZE)
+    assert "pure rotation" in found.flags
+    assert not found.success
