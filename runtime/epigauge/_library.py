@@ -18,7 +18,7 @@ from epigauge_generated.c_backend import DIGEST as C_DIGEST
 
 from epigauge.errors import ArgumentError, BackendError
 
-__all__ = ["LEVELS", "address", "library", "usable", "variant"]
+__all__ = ["LEVELS", "address", "failed", "library", "usable", "variant"]
 
 #: Names of the variants by the level of the x86-64 ABI they need, the fastest first.
 LEVELS = {4: "x86-64-v4", 3: "x86-64-v3", 0: "baseline"}
@@ -84,6 +84,9 @@ def _choose() -> tuple[str, ctypes.CDLL]:
 def _usable(files: dict[str, str]) -> tuple[ctypes.CDLL, dict[str, int]]:
     """Return the baseline library, and the levels of all usable ones by name, the fastest first."""
     if "" not in files:
+        if failed():
+            remedy = "pip install -v shows why; mend that, then install epigauge again"
+            raise BackendError("c", "could not be compiled when epigauge was installed", remedy)
         remedy = "install a C compiler, then epigauge again"
         raise BackendError("c", "was not built when epigauge was installed", remedy)
     baseline = _loaded(files[""])
@@ -92,6 +95,12 @@ def _usable(files: dict[str, str]) -> tuple[ctypes.CDLL, dict[str, int]]:
         name: level for level, name in LEVELS.items() if level <= able and _suffix(level) in files
     }
     return baseline, levels
+
+
+def failed() -> bool:
+    """Tell whether compiling was tried and failed: pyproject.toml lets the build leave a note."""
+    note = resources.files("epigauge_generated.c_backend").joinpath("not_compiled.txt")
+    return note.is_file()
 
 
 def _suffix(level: int) -> str:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import ctypes
 import importlib
 import importlib.util
+import logging
 import math
 import threading
 from collections.abc import Callable
@@ -25,7 +26,7 @@ from epigauge_generated.signatures import SIGNATURES, Argument, Signature
 from numpy.typing import NDArray
 
 from epigauge._arguments import as_choice
-from epigauge._library import library
+from epigauge._library import failed, library
 from epigauge._options import Backend
 from epigauge.errors import BackendError
 
@@ -36,6 +37,7 @@ NAMES = ("c", "numpy", "casadi")
 Array = NDArray[np.float64]
 Kernel = Callable[..., Any]
 
+_LOG = logging.getLogger("epigauge")
 _lock = threading.Lock()
 _active: str | None = None
 
@@ -117,7 +119,14 @@ def backend() -> str:
     global _active
     with _lock:
         if _active is None:
-            _active = "c" if available()["c"] is None else "numpy"
+            reason = available()["c"]
+            _active = "c" if reason is None else "numpy"
+            if reason is not None and failed():
+                _LOG.warning(
+                    "the C library %s: NumPy computes the same, many times slower "
+                    "(pip install -v shows why; set_backend('numpy') accepts it)",
+                    reason,
+                )
         return _active
 
 

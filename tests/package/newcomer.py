@@ -58,18 +58,33 @@ def walk(quick: bool, programs: bool = True) -> Iterator[tuple[str, list[str]]]:
         yield f"{name}: bad input", list(cli.bad_inputs(command, run, quick))
     yield "flags in the documentation", list(flags_in_pages())
     yield "names in the documentation", list(names_in_pages())
+    yield "links in the documentation", list(links_in_pages())
     if not quick:
         yield from examples(programs)
         yield "docstrings", list(docstrings())
         yield "pages in a browser", list(in_browser(Path()))
 
 
+def sources() -> list[Path]:
+    """Return the pages as they are written."""
+    found = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").rglob("*.md"))]
+    return [page for page in found if "_build" not in page.parts]
+
+
+def links_in_pages() -> Iterator[str]:
+    """Yield links and pictures of a page that lead to no file."""
+    for page in sources():
+        text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+        for target in re.findall(r"\]\(([^)\s#]+)[^)]*\)", re.sub(r"`[^`]*`", "", text)):
+            if "://" not in target and not (page.parent / target).exists():
+                yield f"{page.relative_to(CHECKOUT)}: {target} leads nowhere"
+
+
 def names_in_pages() -> Iterator[str]:
     """Yield names of the package that a page uses and that nobody reaches after importing it."""
     import epigauge as eg
 
-    pages = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").rglob("*.md"))]
-    for page in pages:
+    for page in sources():
         for name in set(re.findall(r"\beg\.([a-zA-Z]\w*)", page.read_text(encoding="utf-8"))):
             try:
                 eg.__getattr__(name)  # not what other imports have left there

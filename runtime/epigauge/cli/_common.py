@@ -102,6 +102,7 @@ def console() -> Console:
 def set_loudness(quiet: bool, verbose: int) -> None:
     """Choose how much people are told: nothing, or also what the solvers log."""
     _quiet.set(quiet)
+    logging.getLogger("epigauge").setLevel(logging.ERROR if quiet else logging.NOTSET)
     if verbose:
         level = logging.INFO if verbose == 1 else logging.DEBUG
         logging.basicConfig(level=level, format="%(message)s", stream=sys.stderr, force=True)

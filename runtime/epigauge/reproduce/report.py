@@ -232,6 +232,7 @@ td.number {{ text-align: right; font-variant-numeric: tabular-nums; white-space:
 caption, figcaption {{ text-align: left; font-size: 14px; color: #555; padding: .3rem 0; }}
 figure {{ margin: 1rem 0 1.5rem; }}
 img {{ max-width: 100%; }}
+.wide {{ overflow-x: auto; }}
 .confirmed {{ color: #1b7837; font-weight: 600; white-space: nowrap; }}
 .not {{ color: #c1121f; font-weight: 600; white-space: nowrap; }}
 </style>
@@ -289,7 +290,8 @@ def _html_table(table: Table) -> str:
             cells.append(f"<td{style}>{html.escape(text)}</td>")
         lines.append(f"<tr>{''.join(cells)}</tr>")
     caption = f"<caption>{html.escape(table.caption)}</caption>" if table.caption else ""
-    return f"<table>{caption}<tr>{head}</tr>\n" + "\n".join(lines) + "</table>"
+    rows = f"{caption}<tr>{head}</tr>\n" + "\n".join(lines)
+    return f'<div class="wide" data-scrolls><table>{rows}</table></div>'
 
 
 def _numeric(table: Table) -> list[bool]:
