@@ -18,10 +18,16 @@ from epigauge_generated.c_backend import DIGEST as C_DIGEST
 
 from epigauge.errors import ArgumentError, BackendError
 
-__all__ = ["LEVELS", "address", "failed", "library", "usable", "variant"]
+__all__ = ["LEVELS", "NOT_COMPILED", "address", "failed", "library", "usable", "variant"]
 
 #: Names of the variants by the level of the x86-64 ABI they need, the fastest first.
 LEVELS = {4: "x86-64-v4", 3: "x86-64-v3", 0: "baseline"}
+
+#: What is told at first use where the build has left a note that compiling failed.
+NOT_COMPILED = (
+    "the C library could not be compiled when epigauge was installed: NumPy computes the same, "
+    "many times slower (pip install -v shows why; epigauge.set_backend('numpy') accepts it)"
+)
 
 #: Names one of them instead of the fastest that the processor can run.
 CHOICE = "EPIGAUGE_PROCESSOR"

@@ -14,9 +14,9 @@ from __future__ import annotations
 import ctypes
 import importlib
 import importlib.util
-import logging
 import math
 import threading
+import warnings
 from collections.abc import Callable
 from functools import cache
 from typing import Any, cast
@@ -26,7 +26,7 @@ from epigauge_generated.signatures import SIGNATURES, Argument, Signature
 from numpy.typing import NDArray
 
 from epigauge._arguments import as_choice
-from epigauge._library import failed, library
+from epigauge._library import NOT_COMPILED, failed, library
 from epigauge._options import Backend
 from epigauge.errors import BackendError
 
@@ -37,7 +37,6 @@ NAMES = ("c", "numpy", "casadi")
 Array = NDArray[np.float64]
 Kernel = Callable[..., Any]
 
-_LOG = logging.getLogger("epigauge")
 _lock = threading.Lock()
 _active: str | None = None
 
@@ -122,11 +121,7 @@ def backend() -> str:
             reason = available()["c"]
             _active = "c" if reason is None else "numpy"
             if reason is not None and failed():
-                _LOG.warning(
-                    "the C library %s: NumPy computes the same, many times slower "
-                    "(pip install -v shows why; set_backend('numpy') accepts it)",
-                    reason,
-                )
+                warnings.warn(NOT_COMPILED, RuntimeWarning, stacklevel=2)
         return _active
 
 

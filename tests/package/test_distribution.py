@@ -131,4 +131,6 @@ def test_wheel_without_compiler_is_pure_python(
 ) -> None:
     wheel = build("wheel", unpacked, tmp_path, **environment)
     assert wheel.name.endswith("-py3-none-any.whl")
-    assert {name for name in wheel_names(wheel) if ".dist-info/" not in name} == modules()
+    plain = {name for name in wheel_names(wheel) if ".dist-info/" not in name}
+    note = {"epigauge_generated/c_backend/not_compiled.txt"} if "CC" in environment else set()
+    assert plain == modules() | note

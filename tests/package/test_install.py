@@ -32,6 +32,19 @@ def test_absent_library_is_an_error_with_a_remedy() -> None:
         epigauge.set_backend("c")
 
 
+def test_a_failed_compile_is_told_at_first_use() -> None:
+    """By the note that the build leaves then; see test_distribution.py."""
+    patched = "from epigauge import _library, kernels; _library._files = dict; "
+    patched += "_library.failed = kernels.failed = lambda: True; "
+    code = patched + "import epigauge; print(epigauge.backend(), epigauge.backend())"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.split() == ["numpy", "numpy"]
+    assert run.stderr.count("could not be compiled") == 1
+    quiet = patched + "import epigauge; epigauge.set_backend('numpy'); epigauge.backend()"
+    run = subprocess.run([sys.executable, "-c", quiet], capture_output=True, text=True, check=True)
+    assert run.stderr == ""
+
+
 def test_program_of_a_user_runs() -> None:
     """What `tox -e types` checks the types of."""
     program = Path(__file__).with_name("consumer.py")

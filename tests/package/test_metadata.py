@@ -61,3 +61,21 @@ def test_conda_recipe_asks_for_what_the_package_asks_for() -> None:
     assert f">={stated.pop('python')}" == PROJECT["requires-python"]
     assert {"numpy", "typer", "rich"} <= stated.keys()
     assert {name: asked[renamed.get(name, name)] for name in stated} == stated
+
+
+def test_the_index_shows_a_page_without_links_into_the_checkout() -> None:
+    page = (CHECKOUT / PROJECT["readme"]).read_text(encoding="utf-8")
+    assert not re.search(r"\]\((?!https?://)", page)
+    whole = (CHECKOUT / "README.md").read_text(encoding="utf-8")
+    fence = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+    assert fence.findall(page)
+    assert all(code in whole for code in fence.findall(page))  # which is run
+    commands = [line.split()[:3] for line in page.splitlines() if line.startswith("$ epigauge")]
+    assert commands
+    assert all(" ".join(words) in whole for words in commands)
+
+
+def test_addresses_are_open_about_being_placeholders() -> None:
+    """Until there are public ones: names in .example are reserved, nobody can own them."""
+    for address in PROJECT["urls"].values():
+        assert re.match(r"https://([\w.-]+\.)?epigauge\.example(/|$)", address)

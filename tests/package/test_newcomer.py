@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -108,3 +109,53 @@ def test_files_that_are_nothing_are_seen(name: str, content: bytes, tmp_path: Pa
     assert commands.opened(path) == "was not written"
     path.write_bytes(content)
     assert commands.opened(path)
+
+
+def helped(text: str) -> commands.Runner:
+    """Return a run of every command that answers with this help."""
+    return lambda *words, **_: commands.Run(list(words), 0, text.encode(), "")
+
+
+def test_faults_of_a_help_are_seen() -> None:
+    command = commands.commands()["samples"]
+    whole = commands.in_process("samples", "--help").out.decode()
+    assert commands.help_of(command, helped(whole)) == []
+    (flag, *_) = (flag for option in command.options for flag in option.flags if flag[0] == "-")
+    missing = commands.help_of(command, helped(whole.replace(flag, " " * len(flag))))
+    assert any(f"misses {flag}" in found for found in missing)
+    wide = commands.help_of(command, helped(whole + "x" * 81))
+    assert any("overflows" in found for found in wide)
+    assert any("says nothing" in found for found in commands.help_of(None, helped("")))
+
+
+def test_a_traceback_and_a_file_that_is_not_written_are_seen(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("planted")
+
+    command = commands.commands()["refine"]
+    done = commands.in_process(*command.words())
+    silent = commands.Run(done.words, 0, done.out, done.err)
+    unwritten = list(commands.written(command, lambda *words, **_: silent, "planted"))
+    assert any("was not written" in found for found in unwritten)
+    monkeypatch.setattr(sys.modules["epigauge.cli.refine"], "load_matches", broken)
+    assert "traceback" in commands.in_process(*command.words()).check(0)[0]
+
+
+def test_faults_of_the_documentation_are_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    walk = newcomer()
+    monkeypatch.setattr(walk, "CHECKOUT", tmp_path)
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "CONTRIBUTING.md").write_text("")
+    page = tmp_path / "README.md"
+    page.write_text("`eg.load_matches`, [x](docs), `a[0](b)`\n\n    epigauge refine x --plot y\n")
+    checks = walk.names_in_pages, walk.links_in_pages, walk.flags_in_pages
+    assert [list(check()) for check in checks] == [[], [], []]
+    page.write_text("eg.no_name, ![x](docs/no.png)\n\n    epigauge refine x --no-flag\n")
+    found = [" ".join(check()) for check in checks]
+    assert "no eg.no_name" in found[0]
+    assert "docs/no.png leads nowhere" in found[1]
+    assert "there is no --no-flag" in found[2]

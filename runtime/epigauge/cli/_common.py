@@ -10,6 +10,7 @@ import re
 import shutil
 import sys
 import tempfile
+import warnings
 from collections.abc import Callable
 from contextvars import ContextVar
 from pathlib import Path
@@ -21,7 +22,7 @@ from rich.markup import escape
 from rich.table import Table
 
 import epigauge as eg
-from epigauge import verdicts
+from epigauge import _library, verdicts
 from epigauge._results import SCHEMA
 from epigauge.errors import EpigaugeError
 from epigauge.io.output import json_text, plain
@@ -102,7 +103,9 @@ def console() -> Console:
 def set_loudness(quiet: bool, verbose: int) -> None:
     """Choose how much people are told: nothing, or also what the solvers log."""
     _quiet.set(quiet)
-    logging.getLogger("epigauge").setLevel(logging.ERROR if quiet else logging.NOTSET)
+    warnings.filterwarnings("ignore", re.escape(_library.NOT_COMPILED))  # told here, on one line
+    if _library.failed() and not quiet:
+        typer.echo(f"epigauge: {_library.NOT_COMPILED}", err=True)
     if verbose:
         level = logging.INFO if verbose == 1 else logging.DEBUG
         logging.basicConfig(level=level, format="%(message)s", stream=sys.stderr, force=True)
