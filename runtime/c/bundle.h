@@ -59,6 +59,12 @@ typedef struct {
     double lam, factor, tolerance;
 } eg_refinement;
 
+/* ---------------------------------------------------------------- bundle_lanes.c */
+
+EG_EXPORT ptrdiff_t eg_bundle_chunks(
+    ptrdiff_t n, ptrdiff_t m, const ptrdiff_t *first, const ptrdiff_t *view, ptrdiff_t *points,
+    ptrdiff_t *lanes, ptrdiff_t *rows, int32_t *point, int32_t *count);
+
 /* ---------------------------------------------------------------- bundle.c */
 
 EG_EXPORT void eg_bundle_pack(
@@ -138,6 +144,17 @@ EG_EXPORT int eg_bundle_distances(
     const ptrdiff_t *first, double *distances);
 
 EG_EXPORT int eg_spreading_basis(ptrdiff_t m, const double *Q, double *T);
+
+/* ---------------------------------------------------------------- frames.c */
+
+EG_EXPORT int eg_change_basis(
+    ptrdiff_t n, ptrdiff_t m, const double *T, int fit, double *gamma, double *alpha, const double *P,
+    const double *Q, double *moved_P, double *moved_Q);
+
+EG_EXPORT double eg_image_frame(
+    ptrdiff_t n, ptrdiff_t count, const ptrdiff_t *view, const double *xy, double *origins);
+
+/* ---------------------------------------------------------------- bundle_start.c */
 
 EG_EXPORT int eg_resect(
     ptrdiff_t count, const double *q, const double *Q, double scale2, double ftol,

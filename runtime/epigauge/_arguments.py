@@ -501,6 +501,8 @@ def as_double(array: NDArray[Any]) -> Array:
     A long double beyond its range becomes infinite and a signalling NaN a quiet one, to be
     refused later.
     """
+    if array.dtype == np.float64 and array.dtype.isnative and array.flags.aligned:
+        return array
     with np.errstate(over="ignore", invalid="ignore"):
         return array.astype(np.float64, copy=not array.flags.aligned)
 

@@ -142,6 +142,7 @@ TRACE, BLOCK = 0, 1
 #: Results and arguments. The first three of most are the bundle and a range of its chunks.
 _RANGE = (_P, _N, _N)
 _TYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "bundle_chunks": (_N, (_N, _N, *[_P] * 7)),
     "bundle_pack": (None, (_P,) * 8),
     "camera_model_row": (_N, (ctypes.c_char_p,)),
     "bundle_widths": (None, (_P, _P, _P)),
@@ -160,6 +161,8 @@ _TYPES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "bundle_intersect": (_I, (*_RANGE, _P, _P)),
     "bundle_distances": (_I, (*_RANGE, *[_P] * 4)),
     "spreading_basis": (_I, (_N, _P, _P)),
+    "change_basis": (_I, (_N, _N, _P, _I, *[_P] * 6)),
+    "image_frame": (_D, (_N, _N, *[_P] * 3)),
     "resect": (_I, (_N, _P, _P, _D, _D, _N, _P)),
     "bundle_minimize": (_I, (_P,) * 10),
     "envelope_factor": (_I, (_P, _P)),

@@ -34,6 +34,9 @@ Array = NDArray[np.float64]
 #: With so few observations, no run keeps Ctrl-C waiting for long.
 _QUICK = 5000
 
+#: Schedules that the compiled loop has.
+_SCHEDULES = lm.Classic(), lm.Adaptive()
+
 
 class Minimum(NamedTuple):
     """Where the compiled loop ended.
@@ -95,7 +98,7 @@ def minimized(
         type(schedule) is lm.Adaptive,
     )
     blocks = np.empty((n, d, d)), np.empty((m, b, b)), np.empty((n, d)), np.empty((m, b))
-    normal = NormalArrays(*map(address, blocks))
+    filled = NormalArrays(*map(address, blocks))
     history = np.empty((stopping.max_iter + 1, len(lm.Row.__dataclass_fields__)))
     cost, counts = ctypes.c_double(), np.zeros(4, np.intp)
     panels = skyline.panels(own.width)
@@ -108,7 +111,7 @@ def minimized(
                 panels.reference,
                 ctypes.addressof(options),
                 *map(address, (cameras, points)),
-                ctypes.addressof(normal),
+                ctypes.addressof(filled),
                 address(history),
                 ctypes.addressof(cost),
                 address(counts),
@@ -119,16 +122,12 @@ def minimized(
     checked(run() if quick else _interruptible(run, stop))
     nfev, njev, nit, status = counts.tolist()
     rows = lm.rows(history[:nfev], scale)
-    U, g_cameras = blocks[0], blocks[2]
-    points, V, g_points = (_put(order, array) for array in (points, blocks[1], blocks[3]))
-    return Minimum(
-        own.layout.outward(cameras),
-        points,
-        cost.value,
-        None if own.factored else own.normal(cameras, points, U, V, g_cameras, g_points),
-        (nfev, njev, nit, status),
-        rows,
-    )
+    points, normal = _put(order, points), None
+    if not own.factored:
+        V, g_points = (_put(order, array) for array in (blocks[1], blocks[3]))
+        normal = own.normal(cameras, points, blocks[0], V, blocks[2], g_points)
+    found = own.layout.outward(cameras)
+    return Minimum(found, points, cost.value, normal, (nfev, njev, nit, status), rows)
 
 
 def _put(order: NDArray[np.intp], rows: Array) -> Array:
@@ -163,6 +162,6 @@ def _known(problem: BundleProblem, own: NativeLinearizer, damping: Any, schedule
         and not problem.kinds
         and problem.refinement is not None
         and type(damping) is Covariant
-        and schedule in (lm.Classic(), lm.Adaptive())
+        and schedule in _SCHEDULES
         and own.direct
     )

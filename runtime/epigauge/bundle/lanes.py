@@ -22,9 +22,6 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Range = tuple[int, int]
 
-#: Observations a chunk, so that it stays in the fast cache, and the most lanes.
-_ROWS, _MOST_LANES = 384, 56
-
 #: Cameras of which a full matrix is factored in no time.
 FULL = 10
 
@@ -77,27 +74,32 @@ class LaneLayout:
     ) -> None:
         self._beside = beside
         self._graph, self._q, self._weights, self.columns = graph, q, weights, columns
-        counts = np.diff(graph.first)
-        self.points = points = _together(graph, counts)
-        self.lanes, self.rows = _chunks(counts[points])
-        filling, rows = self.lanes[-1] - len(points), self.rows[-1]
-        self._point = np.concatenate([points, np.full(filling, points[-1])]).astype(np.int32)
-        self._count = np.concatenate([counts[points], np.zeros(filling)]).astype(np.int32)
-        self._observed = np.empty(rows, np.int32), np.empty(2 * rows), np.empty(rows)
+        self._first, view = np.ascontiguousarray(graph.first), np.ascontiguousarray(graph.view)
+        n, m = graph.n_views, graph.n_points
+        self.points = np.empty(m, np.intp)
+        lanes, rows = np.empty((2, m // LANES + 2), np.intp)
+        self._point, self._count = np.empty((2, m + LANES), np.int32)
+        order = (self._first, view, self.points, lanes, rows, self._point, self._count)
+        chunks = function("bundle_chunks")(n, m, *map(address, order))
+        if chunks < 0:
+            raise MemoryError(f"no memory for {m} points")
+        self.lanes, self.rows = lanes[: chunks + 1], rows[: chunks + 1]
+        last = int(self.rows[-1])
+        self._observed = np.empty(last, np.int32), np.empty(2 * last), np.empty(last)
         self.order: Indices | None = None
         self._skyline: Skyline | None = None
         arrays = (self.lanes, self.rows, self._point, self._count, *self._observed)
         self._bundle = Bundle(
-            graph.n_views,
-            graph.n_points,
-            len(self.lanes) - 1,
+            n,
+            m,
+            chunks,
             *map(address, arrays),
             least=LEAST_WEIGHT * float(weights.max() if heaviest is None else heaviest),
             model=model,
             width=len(columns),
             columns=address(columns),
         )
-        self._pack(graph.view, q, weights)
+        self._pack(view, q, weights)
 
     def bundle(self, loss: Loss) -> Bundle:
         """Return the C structure."""
@@ -172,7 +174,7 @@ class LaneLayout:
 
     def _pack(self, view: Indices, q: Array, weights: Array) -> None:
         """Copy the observations, sorted by point, then view."""
-        arrays = [np.ascontiguousarray(a) for a in (self._graph.first, view, q, weights)]
+        arrays = self._first, *map(np.ascontiguousarray, (view, q, weights))
         reference = ctypes.byref(self._bundle)
         function("bundle_pack")(reference, *map(address, (*arrays, *self._observed)))
 
@@ -183,23 +185,3 @@ def _ranges(work: Indices, count: int) -> list[Range]:
     cuts = np.searchsorted(middles, work.sum() * np.arange(1, count) / count)
     edges = [0, *cuts.tolist(), len(work)]
     return [(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
-
-
-def _together(graph: ObservationGraph, counts: Indices) -> Indices:
-    """Return the points by falling number of observations, those of the same views together."""
-    first, last, view = graph.first[:-1], graph.first[1:] - 1, graph.view
-    return np.lexsort((view[last], view[np.minimum(first + 1, last)], view[first], -counts))
-
-
-def _chunks(counts: Indices) -> tuple[Indices, Indices]:
-    """Return where the lanes and the rows of each chunk begin, for falling counts."""
-    m = len(counts)
-    widths = np.clip(_ROWS // counts // LANES * LANES, LANES, _MOST_LANES).tolist()
-    begins, begin = [], 0
-    while begin < m:
-        begins.append(begin)
-        begin += widths[begin]
-    # The last chunk has as many lanes as it needs, in full vectors.
-    lanes = np.append(begins, min(begin, begins[-1] + -(-(m - begins[-1]) // LANES) * LANES))
-    rows = np.concatenate([[0], np.cumsum(np.diff(lanes) * counts[begins])])
-    return lanes.astype(np.intp), rows.astype(np.intp)

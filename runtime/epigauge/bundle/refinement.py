@@ -87,6 +87,8 @@ def listed(name: str, value: Iterable[int]) -> tuple[int, ...]:
 
 def fixed_indices(name: str, value: Iterable[int], count: int) -> Indices:
     """Return numbers of views or points to be fixed, each once."""
+    if isinstance(value, tuple) and not value:
+        return np.zeros(0, np.intp)
     array = np.asarray(value if isinstance(value, np.ndarray) else list(value))
     if array.size == 0:
         return np.zeros(0, np.intp)

@@ -70,7 +70,7 @@ class Skyline:
         """Return the number of blocks."""
         return int(self.slot[-1])
 
-    @property
+    @cached_property
     def work(self) -> float:
         """Return the operations of a factorisation, in products of blocks."""
         return float(np.sum(np.diff(self.slot).astype(np.float64) ** 2)) / 2.0

@@ -7,7 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge._library import address
+from epigauge._native import checked, function
 from epigauge.errors import ArgumentError
+from epigauge.kernels import backend
 from epigauge.multi_view.tracks import Tracks
 
 __all__ = ["Frame", "counted"]
@@ -35,11 +38,17 @@ class Frame:
     def of(tracks: Tracks) -> Frame:
         """Choose the coordinates for some tracks, without observations of weight zero."""
         tracks = counted(tracks)
-        counts = np.bincount(tracks.view, minlength=tracks.n_views)
-        sums = [np.bincount(tracks.view, tracks.xy[:, k]) / counts for k in (0, 1)]
-        origins = np.stack(sums, axis=1)
-        centred = tracks.xy - origins[tracks.view]
-        scale = float(np.sqrt(np.vdot(centred, centred) / centred.size))
+        n, view, xy = tracks.n_views, tracks.view, tracks.xy
+        if backend() == "c":
+            origins = np.empty((n, 2))
+            scale = function("image_frame")(n, len(view), *map(address, (view, xy, origins)))
+            checked(scale < 0.0)
+        else:
+            counts = np.bincount(view, minlength=n)
+            sums = [np.bincount(view, xy[:, k]) / counts for k in (0, 1)]
+            origins = np.stack(sums, axis=1)
+            centred = xy - origins[view]
+            scale = float(np.sqrt(np.vdot(centred, centred) / centred.size))
         if not scale > 0.0:
             raise ArgumentError("tracks", "have all points of a view at one place", "other points")
         return Frame(origins, scale)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -209,10 +210,10 @@ def _homogeneous(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
         needed = ", ".join(map(str, shape))
         raise ArgumentError(name, f"is {array.dtype} {array.shape}", f"real numbers, (n, {needed})")
     array = np.ascontiguousarray(as_double(array))
-    size = np.abs(array).max(axis=tuple(range(1, array.ndim)))
-    bad = np.flatnonzero(~((size >= MIN_SIZE) & (size <= MAX_SIZE)))
-    if len(bad):
-        row = bad[0]
+    size = np.abs(array.reshape(len(array), math.prod(shape))).max(axis=1)
+    good = (size >= MIN_SIZE) & (size <= MAX_SIZE)
+    if not good.all():
+        row = int(np.argmin(good))
         what = f"of size {size[row]:g}" if np.isfinite(size[row]) else "not finite"
         needed = f"a largest entry between {MIN_SIZE:g} and {MAX_SIZE:g}"
         raise ArgumentError(name, f"is {what} in row {row}", needed)

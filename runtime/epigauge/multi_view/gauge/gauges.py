@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.bundle.similarity import Similarity
-from epigauge.multi_view.gauge.transformations import Transformation
+from epigauge.multi_view.gauge.transformations import Transformation, changed_basis
 from epigauge.scatter import spreading_basis
 
 __all__ = [
@@ -313,11 +313,8 @@ GAUGES = (identity, reference_camera, two_cameras, five_points, normalized)
 
 def _unit_scales(T: Array, P: Array, Q: Array) -> tuple[Transformation, Array, Array]:
     """Return T with the scales that make every camera and point of unit norm, and both moved."""
-    moved_P, moved_Q = P @ T, np.linalg.solve(T, Q.T)
-    gamma = 1.0 / np.sqrt(np.einsum("nij,nij->n", moved_P, moved_P))
-    alpha = 1.0 / np.sqrt(np.einsum("im,im->m", moved_Q, moved_Q))
-    moved = gamma[:, None, None] * moved_P, np.ascontiguousarray((alpha * moved_Q).T)
-    return (Transformation(T, gamma, alpha), *moved)
+    moved_P, moved_Q, gamma, alpha = changed_basis(T, P, Q)
+    return Transformation(T, gamma, alpha), moved_P, moved_Q
 
 
 def _scaled(T: Array, P: Array, third: Array, camera: int) -> Transformation:

@@ -10,13 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
 from epigauge._arguments import as_real
+from epigauge._library import address
+from epigauge._native import function
 from epigauge.bundle.similarity import Similarity
 from epigauge.cameras import AffineReconstruction, MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.rotations import as_rotation
 
-__all__ = ["Gauge", "Transformation", "moved_lines", "similarity", "transform"]
+__all__ = ["Gauge", "Transformation", "changed_basis", "moved_lines", "similarity", "transform"]
 
 Array = NDArray[np.float64]
 
@@ -71,8 +73,7 @@ class Transformation:
         >>> bool(np.allclose(P[0] / P[0, 0, 0], np.eye(3, 4), atol=1e-9))
         True
         """
-        cameras = self.camera_scales[:, None, None] * (P @ self.T)
-        return cameras, self.point_scales[:, None] * np.linalg.solve(self.T, Q.T).T
+        return changed_basis(self.T, P, Q, (self.camera_scales, self.point_scales))[:2]
 
     def lines(self, lines: Array) -> Array:
         """Move lines.
@@ -178,6 +179,31 @@ class Gauge(Protocol):
         >>> change.T.shape
         (4, 4)
         """
+
+
+def changed_basis(
+    T: Array, P: Array, Q: Array, scales: tuple[Array, Array] | None = None
+) -> tuple[Array, Array, Array, Array]:
+    """Return gamma_i P_i T, alpha_j T^-1 Q_j, gamma and alpha; by default those of unit norms."""
+    n, m = len(P), len(Q)
+    if scales is not None and (len(scales[0]), len(scales[1])) != (n, m):
+        scales = np.broadcast_to(scales[0], n), np.broadcast_to(scales[1], m)
+    if kernels.backend() == "c":
+        gamma, alpha = (np.empty(n), np.empty(m)) if scales is None else scales
+        moved_P, moved_Q = np.empty((n, 3, 4)), np.empty((m, 4))
+        given = [np.ascontiguousarray(a, np.float64) for a in (T, gamma, alpha, P, Q)]
+        first, *rest = map(address, (*given, moved_P, moved_Q))
+        if function("change_basis")(n, m, first, scales is None, *rest):
+            raise np.linalg.LinAlgError("the change of basis is singular")
+        return moved_P, moved_Q, gamma, alpha
+    cameras, points = P @ T, np.linalg.solve(T, Q.T)
+    if scales is None:
+        gamma = 1.0 / np.sqrt(np.einsum("nij,nij->n", cameras, cameras))
+        alpha = 1.0 / np.sqrt(np.einsum("im,im->m", points, points))
+    else:
+        gamma, alpha = scales
+    moved = np.ascontiguousarray((alpha * points).T)
+    return gamma[:, None, None] * cameras, moved, gamma, alpha
 
 
 def moved_lines(T: Array, lines: Array) -> Array:

@@ -1,0 +1,116 @@
+/* Changes of basis of projective cameras and points, and the coordinates that images are computed in. */
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "bundle.h"
+
+/* P A = L U of a 4x4 matrix in its place, rows exchanged by their numbers; returns 1 if it is singular. */
+static int factor(double *A, int *rows)
+{
+    for (int k = 0; k < 4; ++k) {
+        int best = k;
+        for (int i = k + 1; i < 4; ++i)
+            if (fabs(A[4 * i + k]) > fabs(A[4 * best + k]))
+                best = i;
+        rows[k] = best;
+        if (A[4 * best + k] == 0.0)
+            return 1;
+        for (int j = 0; j < 4 && best != k; ++j) {
+            const double other = A[4 * k + j];
+            A[4 * k + j] = A[4 * best + j];
+            A[4 * best + j] = other;
+        }
+        for (int i = k + 1; i < 4; ++i) {
+            A[4 * i + k] /= A[4 * k + k];
+            for (int j = k + 1; j < 4; ++j)
+                A[4 * i + j] -= A[4 * i + k] * A[4 * k + j];
+        }
+    }
+    return 0;
+}
+
+static void solve(const double *A, const int *rows, double *x)
+{
+    for (int k = 0; k < 4; ++k) {
+        const double other = x[k];
+        x[k] = x[rows[k]];
+        x[rows[k]] = other;
+    }
+    for (int i = 1; i < 4; ++i)
+        for (int j = 0; j < i; ++j)
+            x[i] -= A[4 * i + j] * x[j];
+    for (int i = 3; i >= 0; --i) {
+        for (int j = i + 1; j < 4; ++j)
+            x[i] -= A[4 * i + j] * x[j];
+        x[i] /= A[4 * i + i];
+    }
+}
+
+/* Multiply by the scale, which is found first where vectors are to have unit norm. */
+static void scaled(int size, int fit, double *scale, double *x)
+{
+    if (fit) {
+        double squared = 0.0;
+        for (int k = 0; k < size; ++k)
+            squared += x[k] * x[k];
+        *scale = 1.0 / sqrt(squared);
+    }
+    for (int k = 0; k < size; ++k)
+        x[k] *= *scale;
+}
+
+/* P_i <- gamma_i P_i T (n, 3, 4) and Q_j <- alpha_j T^-1 Q_j (m, 4). With `fit` the scales are those that
+   make all of unit norm. Returns 1 if T is singular. */
+int eg_change_basis(ptrdiff_t n, ptrdiff_t m, const double *T, int fit, double *gamma, double *alpha,
+                    const double *P, const double *Q, double *moved_P, double *moved_Q)
+{
+    double A[16];
+    int rows[4];
+    memcpy(A, T, sizeof A);
+    if (factor(A, rows))
+        return 1;
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const double *from = P + 12 * i;
+        double *to = moved_P + 12 * i;
+        for (int r = 0; r < 3; ++r)
+            for (int c = 0; c < 4; ++c)
+                to[4 * r + c] = from[4 * r] * T[c] + from[4 * r + 1] * T[4 + c]
+                                + from[4 * r + 2] * T[8 + c] + from[4 * r + 3] * T[12 + c];
+        scaled(12, fit, gamma + i, to);
+    }
+    memcpy(moved_Q, Q, (size_t)(4 * m) * sizeof(double));
+    for (ptrdiff_t j = 0; j < m; ++j) {
+        solve(A, rows, moved_Q + 4 * j);
+        scaled(4, fit, alpha + j, moved_Q + 4 * j);
+    }
+    return 0;
+}
+
+/* Centroid of the image points of each view (n, 2), and the RMS of all coordinates about them. Every view
+   has a point. Returns a negative number without memory. */
+double eg_image_frame(ptrdiff_t n, ptrdiff_t count, const ptrdiff_t *view, const double *xy,
+                      double *origins)
+{
+    ptrdiff_t *seen = calloc((size_t)n, sizeof(ptrdiff_t));
+    double sum = 0.0;
+    if (!seen)
+        return -1.0;
+    memset(origins, 0, (size_t)(2 * n) * sizeof(double));
+    for (ptrdiff_t k = 0; k < count; ++k) {
+        seen[view[k]] += 1;
+        origins[2 * view[k]] += xy[2 * k];
+        origins[2 * view[k] + 1] += xy[2 * k + 1];
+    }
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        origins[2 * i] /= (double)seen[i];
+        origins[2 * i + 1] /= (double)seen[i];
+    }
+    free(seen);
+    for (ptrdiff_t k = 0; k < count; ++k) {
+        const double x = xy[2 * k] - origins[2 * view[k]];
+        const double y = xy[2 * k + 1] - origins[2 * view[k] + 1];
+        sum += x * x + y * y;
+    }
+    return sqrt(sum / (2.0 * (double)count));
+}
