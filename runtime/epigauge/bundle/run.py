@@ -25,13 +25,13 @@ from epigauge.bundle.linearizer import PointRefinement
 from epigauge.bundle.moves import Move, best_conditioned, move_into
 from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.problem import BundleProblem, BundleState, Estimate
+from epigauge.bundle.seeing import seeing
 from epigauge.bundle.similarity import Similarity
 from epigauge.bundle.strategies import STRATEGIES, freedom_of
 from epigauge.cameras import CameraModel
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 from epigauge.multi_view.gauge import GAUGES, Gauge, five_points, identity
-from epigauge.multi_view.resection import resect
 from epigauge.two_view.losses import Loss
 
 __all__ = [
@@ -312,7 +312,7 @@ def minimized_features(
     try:
         # What is fixed must not be moved by a thousandth.
         if homogeneous and not job.fixes_gauge:
-            return far.minimized_from(attempt, first, partial(_seeing, job, graph, kernels))
+            return far.minimized_from(attempt, first, partial(seeing, job, graph, kernels))
         return attempt(first)
     except np.linalg.LinAlgError:
         raise ArgumentError(
@@ -322,17 +322,3 @@ def minimized_features(
             "cameras with different centres, points away from them and not in one plane, or "
             "method='covariant'",
         ) from None
-
-
-def _seeing(job: Job, graph: ObservationGraph, kernels: Table, at: Estimate) -> Estimate:
-    """Return an estimate in which projective cameras blind for all their points are resected."""
-    depths = np.einsum("ki,ki->k", at.cameras[graph.view, 8:], at.points[graph.point])
-    largest = np.zeros(graph.n_views)
-    np.maximum.at(largest, graph.view, np.abs(depths))
-    blind = np.flatnonzero(largest <= _ROUNDING * np.linalg.norm(at.cameras, axis=1))
-    cameras = at.cameras.copy()
-    for i in blind:
-        seen = np.flatnonzero(graph.view == i)
-        P = resect(kernels, job.q[:, seen], at.points[graph.point[seen]].T)
-        cameras[i] = P.ravel()
-    return replace(at, cameras=cameras)
