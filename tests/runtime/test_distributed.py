@@ -56,6 +56,26 @@ def test_a_metric_adjustment_is_that_of_one_process(client: Any, options: dict[s
     the_same(found, eg.bundle_adjust(tracks, start, **here), tolerance)
 
 
+def off(points: Any, others: Any) -> float:
+    """Return the largest distance after a similarity, over the size of the points."""
+    A, B = points - points.mean(axis=0), others - others.mean(axis=0)
+    U, values, Vt = np.linalg.svd(B.T @ A)  # far from a reflection
+    return float(np.abs(A - B @ (U @ Vt) * (values.sum() / np.vdot(B, B))).max() / np.abs(A).max())
+
+
+def test_points_differ_by_rounding_and_a_similarity(client: Any) -> None:
+    # Nothing holds the gauge, which rounding moves: by some 1e-10 of the scene.
+    tracks, start = metric()
+    for options in ({}, {"ftol": 0.0, "max_iter": 3}):
+        found = eg.distributed.bundle_adjust(tracks, client, start, **options)
+        expected = eg.bundle_adjust(tracks, start, **options)
+        assert found.nit == expected.nit
+        # Measured: 2e-14.
+        assert off(expected.reconstruction.X, found.reconstruction.X) < 1e-12
+        sizes = np.abs(expected.fun).max()
+        assert np.abs(found.fun - expected.fun).max() < 1e-10 * sizes
+
+
 @pytest.mark.slow
 def test_projective_and_affine_adjustments_are_those_of_one_process(client: Any) -> None:
     tracks = eg.multi_view_scene(n_points=60, seed=2).tracks
