@@ -129,6 +129,17 @@ def test_few_matches_tell_their_model() -> None:
             assert np.count_nonzero(result.inliers[6:]) >= 12
 
 
+def test_few_matches_with_relief_are_no_plane() -> None:
+    """Eight right ones of a general scene, near a homography by chance, are no success."""
+    x1, x2, _ = scene("F", 20, 0.6, 10)
+    plane = eg.estimate_homography(x1, x2)
+    assert plane.success  # alone it cannot know
+    result = eg.estimate_two_view(x1, x2)
+    assert (result.model, result.success) == ("nothing", False)
+    x1, x2, _ = scene("plane", 20, 0.6, 10)
+    assert eg.estimate_two_view(x1, x2).model == "plane"
+
+
 def test_a_few_sharp_matches_do_not_hide_a_still_camera() -> None:
     x1, x2, _ = scene("still", 20, 0.6, 31)
     assert eg.estimate_two_view(x1, x2).model == "still"

@@ -21,6 +21,7 @@ from epigauge._logged import logged
 from epigauge._options import Backend
 from epigauge._results import Result
 from epigauge.errors import ArgumentError
+from epigauge.two_view.chance import SIGNIFICANT
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.consensus import RANGE, Consensus
 from epigauge.two_view.copies import earliest
@@ -58,6 +59,10 @@ _STEPS, _ROOT = 30, math.sqrt(2.0 * math.pi)
 
 #: The noise of a homography over that of F beyond which there is relief.
 _WIDER = 1.5
+
+#: Relief that the few right matches of a general scene may have, as a share of the range: where F
+#: is not known, those that are near a homography all the same are no plane.
+_RELIEF = 0.15
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,11 +214,11 @@ def estimate_two_view(
     general = estimate_fundamental(x1, x2, seed=seed, backend=backend, **options)
     name: Model = "F" if calibration is None else "E"
     evidence, R, flat = _evidence(name, x1, x2, general, plane, calibration, backend)
-    model = _model(name, general, plane, flat, evidence)
+    known = "no common geometry" not in general.flags
+    flat_enough = plane if known or not _may_have_relief(plane, x1, x2) else None
+    model = _model(name, general, flat_enough, flat, evidence)
     usable = model != "nothing" and (general if model == name else plane).status > 0  # type: ignore[union-attr]
-    with_motion = model == "E" or (
-        calibration is not None and model == "plane" and "no common geometry" not in general.flags
-    )
+    with_motion = model == "E" or (calibration is not None and model == "plane" and known)
     if model == name:
         flags, inliers = general.flags, general.inlier
         usable = usable and general.success
@@ -278,6 +283,21 @@ def _model(
         if turned["log_likelihood"] + fewer < free["log_likelihood"]:
             flags -= {"pure rotation"} - {*general.flags}
     return next(model for flag, model in _MODELS.items() if flag in flags)
+
+
+def _may_have_relief(plane: HomographyResult | None, x1: Array, x2: Array) -> bool:
+    """Tell whether matches of a general scene may be as near a homography by chance.
+
+    Those that are right anywhere in it move alike but for their relief along epipolar lines: of a
+    range of it, each is within a distance of the homography of any four with a chance that grows as
+    the distance. Of so many fours some are expected to have all others near.
+    """
+    if plane is None:
+        return False
+    agreed, extent = len(plane.used), RANGE * condition(x1, x2).scale
+    near = min(2.0 * plane.threshold_px / (_RELIEF * extent), 1.0)
+    expected = math.log10(math.comb(agreed, 4)) + (agreed - 4) * math.log10(max(near, 1e-300))
+    return expected > SIGNIFICANT
 
 
 def _evidence(
