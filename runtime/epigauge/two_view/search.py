@@ -56,6 +56,9 @@ SCALES, FLOOR = (0.003, 0.02, 0.1), 0.01
 #: right ones with noise are seldom good enough.
 _SAMPLES, _LEAST, _PATIENCE = 20_000, 256, 5.0
 
+#: Among fewer matches than the first, at least the second: what agrees by chance is nearly as good.
+_FEW, _LEAST_OF_FEW = 400, 768
+
 #: Threes of matches that a plane is tried from, and twos off it that F is.
 _PLANES, _PAIRS = 64, 512
 
@@ -157,7 +160,7 @@ def search(
     if not kernels.compiled:
         return _Search(kernels, q, order, seed, scale).run()
     width = (ctypes.c_double * 4)(*_WIDTHS)
-    numbers = (seed, _SAMPLES, _LEAST, _PLANES, _PAIRS, _STEPS, len(_WIDTHS))
+    numbers = (seed, _SAMPLES, _least(q.shape[1]), _PLANES, _PAIRS, _STEPS, len(_WIDTHS))
     options = _Options(*numbers, scale, FLOOR, _PATIENCE, width, _DOMINANT)
     order = None if order is None else np.ascontiguousarray(order, dtype=np.intp)
     F, score = np.zeros((3, 3)), np.zeros(1)
@@ -277,7 +280,7 @@ class _Search:
         """Return how many samples find the best geometry so far with some confidence."""
         near = len(self.near(self.F, 3.0 * self.scale))
         samples = _PATIENCE * (self.q.shape[1] / max(near, 7.0)) ** 7
-        return float(min(max(samples, _LEAST), _SAMPLES))
+        return float(min(max(samples, _least(self.q.shape[1])), _SAMPLES))
 
     def seven_points(self) -> int:
         m = self.q.shape[1]
@@ -360,6 +363,11 @@ class _Search:
             F = np.cross(e2[:, :, None], H[None], axis=1)
             # Matches on the plane, as most of the few judges are, say nothing.
             highest = self.best_of(_normalized(F), _BATCH, highest)
+
+
+def _least(m: int) -> int:
+    """Return how many samples are drawn from m matches at least."""
+    return _LEAST_OF_FEW if m < _FEW else _LEAST
 
 
 def _normalized(F: Array) -> Array:
