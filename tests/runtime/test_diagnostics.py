@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 from epigauge.two_view import diagnostics, minima
 from epigauge.two_view.consensus import RANGE
-from epigauge.two_view.diagnostics import AFFINE, _variance_ratio_99, diagnose, planar_bound
+from epigauge.two_view.diagnostics import (
+    AFFINE,
+    _variance_ratio_99,
+    diagnose,
+    planar_bound,
+    still_bound,
+)
 from epigauge.two_view.evidence import evidence
 from epigauge.two_view.homography import fit_homography
 from epigauge.two_view.planes import HIDDEN
@@ -176,7 +182,9 @@ def test_the_bound_of_a_plane_is_fishers_quantile_by_its_degrees_of_freedom() ->
 def test_bounds_are_the_quantiles_that_they_are_said_to_be() -> None:
     stats = pytest.importorskip("scipy.stats")
     assert pytest.approx(stats.chi2.ppf(0.99, 3), abs=0.01) == AFFINE  # what an affine F lacks
-    assert pytest.approx(stats.chi2.ppf(0.99, 8), abs=0.01) == diagnostics._CHI2_8
+    for n in (8, 20, 60):
+        assert still_bound(n) == pytest.approx(8.0 * stats.f.ppf(0.99, 8, 2 * n - 8), rel=0.05)
+    assert still_bound(5000) == pytest.approx(500.0)  # a twentieth of 2 n
     assert pytest.approx(stats.norm.ppf(0.99), abs=1e-3) == diagnostics._NORMAL_99
 
 
@@ -185,6 +193,17 @@ def test_of_many_matches_the_bound_of_a_plane_is_the_geometric_aic() -> None:
     for n, p in ((10**5, 7), (10**6, 5)):
         aic = (n - p) + 2 * (3 * n + p) - 2 * (2 * n + 8)
         assert planar_bound(n, p) == pytest.approx(aic, rel=1e-3)
+
+
+def test_a_still_camera_is_told_as_often_as_its_bound_says() -> None:
+    """F fits such matches too well: by its noise half of these would be planes."""
+    told = 0
+    for seed in range(30):
+        rng = np.random.default_rng([seed, 5])
+        x = rng.uniform([0.0, 0.0], [1280.0, 960.0], (12, 2))
+        x1, x2 = x + 0.5 * rng.standard_normal((2, 12, 2))
+        told += "still camera" in eg.refine_fundamental(x1, x2).flags
+    assert told >= 26
 
 
 def test_wide_residuals_of_a_plane_are_suspicious(evidences) -> None:

@@ -12,6 +12,7 @@ from epigauge.errors import ArgumentError
 from epigauge.two_view.essential import Calibrated, in_front
 from epigauge.two_view.essential_consensus import EssentialConsensus
 from epigauge.two_view.five_point import essential_5point
+from epigauge.two_view.homography import plane_squares
 from two_views import Array, algebraic
 
 F_TELE = 11365.0
@@ -328,3 +329,14 @@ def test_sharp_agreement_counts_beside_repeated_structure(data_dir: Path) -> Non
             assert found.success
             assert degrees(found.t, z["t"][k]) < 0.5
             assert np.degrees(np.linalg.norm(found.R - z["R"][k])) < 0.5
+
+
+def test_distances_to_infinity_are_those_to_the_homography_of_the_rotation() -> None:
+    rng = np.random.default_rng(2)
+    table = kernels.table("numpy")
+    A1, A2 = (np.array([[f, 0.1, 0.3], [0.0, f, -0.2], [0.0, 0.0, 1.0]]) for f in (3.0, 4.0))
+    q1, q2 = rng.standard_normal((2, 2, 20))
+    R = rotation(np.array([0.2, -0.3, 0.25]))
+    found = Calibrated(q1, q2, A1, A2).from_infinity(R)
+    expected = plane_squares(table, A2 @ R @ np.linalg.inv(A1), q1, q2)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)

@@ -113,6 +113,15 @@ def test_titles_do_not_overlap_with_few_points(shape) -> None:
     assert all(box.x1 <= figure.bbox.x1 for box in boxes)
 
 
+def test_a_comparison_shows_the_flags_of_its_methods() -> None:
+    tracks = eg.multi_view_scene(0.1).tracks
+    found = eg.compare(tracks, ["levenberg", "covariant"], max_iter=2)
+    rows = [dataclasses.replace(row, flags=("still camera",)) for row in found.rows[:1]]
+    flagged = dataclasses.replace(found, rows=(*rows, *found.rows[1:]))
+    assert "still camera" in flagged.plot()._suptitle.get_text()
+    assert "still camera" not in found.plot()._suptitle.get_text()
+
+
 def test_curves_that_coincide_take_turns() -> None:
     tracks = eg.multi_view_scene(0.1).tracks
     axes = eg.compare(tracks, ["levenberg", "mclauchlan", "covariant"]).plot().axes[0]

@@ -44,3 +44,11 @@ def test_planes_are_none_and_rotations_are(m: int) -> None:
             noise = 0.5 * rng.standard_normal((2, m, 2))
             result = eg.refine_homography(x1 + noise[0], y[:, :2] / y[:, 2:] + noise[1])
             assert ("pure rotation" in result.flags) == (name == "rotation"), (name, seed)
+
+
+def test_without_noise_only_rounding_is_forgiven() -> None:
+    exact = 1e-24 * np.eye(9)
+    K = np.array([[3.0, 0.0, 0.3], [0.0, 3.0, -0.2], [0.0, 0.0, 1.0]])
+    assert is_of_a_turned_camera(turned(K, (0.2, -0.1, 0.15)), exact, 100)
+    K[0, 0] *= 1.0 + 3e-4  # pixels that are not square
+    assert not is_of_a_turned_camera(turned(K, (0.2, -0.1, 0.15)), exact, 100)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import epigauge as eg
 import numpy as np
 import pytest
 from epigauge import kernels
 from epigauge.two_view.conditioning import condition
+from epigauge.two_view.front_ends import _is_sharp
 from epigauge.two_view.neighbours import accord, ranked
 from epigauge.two_view.search import search
 from two_views import algebraic
@@ -222,3 +225,17 @@ def test_kernels_of_the_search_are_those_with_derivatives(name) -> None:
     np.testing.assert_allclose(side, np.sum(np.cross(e2, h2, axisb=0, axisc=0) * (F @ h1), axis=0))
     factor = table.agreement(F, 0.04, 0.01, q1, q2)
     np.testing.assert_allclose(factor, 1.0 + 0.04 / (squared + 0.01), rtol=1e-12)
+
+
+def test_distances_are_sharp_where_most_of_the_near_ones_are_nearest() -> None:
+    view = eg.two_view_scene(4.0, n_points=300, seed=2)
+    frame = condition(view.x1, view.x2)
+    q1, q2 = frame.forward(view.x1, view.x2)
+    scale, rng = 0.002, np.random.default_rng(1)
+    found = SimpleNamespace(F=frame.from_pixels(view.F_true), sigma=scale)
+    near = scale * rng.standard_normal(300)
+    even = rng.uniform(-12.0 * scale, 12.0 * scale, 300)  # a quarter of them is within three
+    assert _is_sharp(NUMPY, q1, q2, found, near, scale)
+    assert not _is_sharp(NUMPY, q1, q2, found, even, scale)
+    found.sigma = 2.5 * scale
+    assert not _is_sharp(NUMPY, q1, q2, found, near, scale)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import epigauge as eg
 import numpy as np
 import pytest
+from epigauge import kernels
 from epigauge.errors import ArgumentError
 from epigauge.scenes import two_view_scene
 from epigauge.two_view.conditioning import condition, displaced
+from epigauge.two_view.criteria import Reprojection
 from two_views import (
     Array,
     algebraic,
@@ -430,3 +432,19 @@ class TestConditioning:
                 ratios.append(values[1] / values[0])
             assert ratios[0] > 0.94
             assert ratios[1] < 0.8
+
+
+def test_near_both_epipoles_newton_counts_only_where_it_settles() -> None:
+    """Its steps may leave a foot point anywhere there; the bracketed root is the reference."""
+    table = kernels.table("numpy")
+    rng = np.random.default_rng(0)
+    for _ in range(8):
+        U, s, Vt = np.linalg.svd(rng.standard_normal((3, 3)))
+        F = (U[:, :2] * s[:2]) @ Vt[:2] / np.linalg.norm(s[:2])
+        size = 10.0 ** rng.uniform(-5.0, 0.0, 200)
+        q1, q2 = (
+            (e[:2] / e[2])[:, None] + size * rng.standard_normal((2, 200)) for e in (Vt[2], U[:, 2])
+        )
+        found = Reprojection(table, q1, q2).evaluate(F).signed
+        bracketed = table.foot_point_safe(*table.bilinear_frame(F), q1, q2)[2]
+        np.testing.assert_array_less(np.abs(found - bracketed), 1e-9 * size)

@@ -174,16 +174,17 @@ def test_a_match_on_both_epipoles_is_left_out_of_the_equations(monkeypatch):
 
 
 def test_an_ill_conditioned_minimum_is_recognised_at_once(monkeypatch):
-    # Nearly flat: the Hessian's condition is beyond what a Cholesky factor proves.
+    # Nearly flat: the least pivot of the Hessian's Cholesky factor is below what proves it well
+    # conditioned (1e-8), and its eigenvalues are above rounding.
     scene = two_view_scene(5.0, n_points=60, noise_px=0.0, seed=3)
-    X = scene.X * [1.0, 1.0, 1e-4, 1.0]
+    X = scene.X * [1.0, 1.0, 2e-5, 1.0]
     rng = np.random.default_rng(0)
     x1, x2 = (
-        h[:, :2] / h[:, 2:] + 1e-6 * rng.standard_normal((60, 2))
+        h[:, :2] / h[:, 2:] + 3e-6 * rng.standard_normal((60, 2))
         for h in (X @ scene.P1.T, X @ scene.P2.T)
     )
     start = eg.refine_fundamental(x1, x2, scene.F_true, ftol=1e-14).F
-    for result in both(monkeypatch, x1, x2, F0=start, ftol=1e-3, gtol=0.0):
+    for result in both(monkeypatch, x1, x2, F0=start, ftol=0.3, gtol=0.0):
         assert 1e5 < result.condition < 1e7
         assert (result.status, result.nfev) == (4, 1)
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from epigauge.bundle.strategies import STRATEGIES
 from epigauge.plots._style import GREY, RED, count_whole, finish, heading, new_figure
+from epigauge.verdicts import ordered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -70,7 +71,8 @@ def plot_comparison(comparison: Comparison, title: str = "") -> Figure:
     >>> plot_comparison(eg.compare(tracks))  # doctest: +SKIP
     """
     figure = new_figure(_WIDTH, 5.6)
-    heading(figure, "Convergence of the methods" + (f": {title}" if title else ""))
+    flags = ordered(flag for row in comparison.rows for flag in row.flags)
+    heading(figure, "Convergence of the methods" + (f": {title}" if title else ""), flags=flags)
     axes, table = figure.subplots(1, 2, width_ratios=(1.4, 1.0))
     best = min((row.cost for row in comparison.rows if np.isfinite(row.cost)), default=0.0)
     # Below this the costs of two converged runs do not differ by anything but where they stopped.

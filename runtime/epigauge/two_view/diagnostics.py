@@ -75,8 +75,7 @@ _AIC_RATIO = 1.5
 _NORMAL_99 = 2.326
 
 #: A camera stood still when no motion fits as well as the homography: by the 99 % quantile of
-#: chi-square with its 8 parameters, or to a twentieth of the variance of the noise.
-_CHI2_8 = 20.09
+#: Fisher's F with its 8 parameters, or to a twentieth of the variance of the noise.
 _STILL = 0.05
 
 #: Real points are hardly measured worse than to so many pixels, in a thousandth of the focal length
@@ -129,7 +128,9 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
       than 8 s from the homography that most are on, the others by one per cent of the range at
       most, RMS; at most a quarter where all are within half a per cent, RMS. Such a scene
       is planar where all are within a thousandth, RMS, but for those that agree by chance;
-    - still camera: planar, and ``S_I - S_H <= max(20.1, 0.1 n) s^2``; in place of the former;
+    - still camera: planar, and ``S_I - S_H <= max(8 F99, 0.1 n) s_H^2``, F99 being the quantile
+      for 8 and 2 n - 8 degrees of freedom and ``s_H^2 = S_H / (2 n - 8)`` the noise, since F fits a
+      plane too well; in place of the former;
     - pure rotation: planar, and H = K R K^-1 within three standard deviations, with square pixels
       and a focal length and principal point that cameras have. Of calibrated cameras, planar, and
       the same bound holds for ``S_R / (2 n - 3)``, the rotation's;
@@ -215,13 +216,9 @@ def planar_bound(n: int, parameters: int) -> float:
     return (2 * n - 8) * ratio
 
 
-def still_bound(n: int, redundancy: int | None = None) -> float:
-    """Return by how much, in units of the noise squared, no motion may fit worse than H does.
-
-    With a redundancy the noise is that of H itself: the bound is the quantile of Fisher's F then.
-    """
-    known = _CHI2_8 if redundancy is None else 8.0 * _variance_ratio_99(8, max(redundancy, 4))
-    return max(known, 2 * n * _STILL)
+def still_bound(n: int) -> float:
+    """Return by how much no motion may fit worse than H does, in units of its noise squared."""
+    return max(8.0 * _variance_ratio_99(8, max(2 * n - 8, 4)), 2 * n * _STILL)
 
 
 def plane_flags(found: Evidence, *, tested: bool = False) -> dict[str, bool]:
@@ -246,9 +243,9 @@ def plane_flags(found: Evidence, *, tested: bool = False) -> dict[str, bool]:
     nearly = few and model.relief <= (RELIEF * RANGE) ** 2
     explained = explained or (nearly and model.flat)
     q1, q2 = found.q1[:, on], found.q2[:, on]
-    more = displacement(found, q1, q2, weights) - model.cost
+    n, more = len(weights), displacement(found, q1, q2, weights) - model.cost
     if found.from_rays is None:
-        maps, redundancy = (found.to_units1, found.to_units2), len(weights) - found.parameters
+        maps, redundancy = (found.to_units1, found.to_units2), n - found.parameters
         turned = explained and may_be_rotation(
             *maps, model.H, model.normal, noise2**0.5, redundancy
         )
@@ -256,9 +253,8 @@ def plane_flags(found: Evidence, *, tested: bool = False) -> dict[str, bool]:
         squared = Calibrated(q1, q2, *found.from_rays).from_rotation(weights)
         with np.errstate(invalid="ignore"):  # a match that no rotation maps: none is claimed
             S_R = float(weights @ squared)
-        n = len(weights)
         turned = (2 * n - 3) * bound >= (2 * n - 8) * S_R
-    still = explained and more <= still_bound(len(weights)) * noise2
+    still = explained and more <= still_bound(n) * max(model.cost / max(2 * n - 8, 1), ROUNDING**2)
     return {
         "still camera": still,
         "planar scene": explained and not still,

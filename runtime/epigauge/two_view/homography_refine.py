@@ -361,7 +361,7 @@ def _flags(
     told["undetermined"] = is_plane_left_open(problem.kernels, state.H, q1, q2, near)
     moved = q2 - q1 - (to2[:2, 2] - to1[:2, 2])[:, None]
     more = float(weights @ np.sum(moved**2, axis=0)) / 2.0 - float(np.sum(squared))
-    told["still camera"] = more <= still_bound(n, 2 * n - PARAMETERS) * noise2
+    told["still camera"] = more <= still_bound(n) * noise2
     if not told["still camera"]:
         B = across(state.H)
         spread, N = wider * max(noise, ROUNDING), B @ N @ B.T
