@@ -60,6 +60,19 @@ def test_page_holds_every_point_and_camera_with_its_numbers(tmp_path) -> None:
         np.testing.assert_allclose(camera["corners"], FRAME.corners[k], atol=1e-4)
 
 
+def test_the_view_is_fitted_to_the_scene_and_not_to_what_is_behind_it(tmp_path) -> None:
+    def extent(far: float) -> float:
+        points = FRAME.points.copy()
+        points[:4] += [far, 0.0, 0.0]
+        path = tmp_path / "far.html"
+        moved = dataclasses.replace(FRAME, points=points)
+        save_viewer(path, RESULT, SCENE.tracks, frame=moved)
+        bounds = np.array(data_of(path.read_text(encoding="utf-8"))["bounds"])
+        return float(np.ptp(bounds, axis=0).max())
+
+    assert extent(40.0) <= extent(0.0)
+
+
 def test_page_needs_nothing_else_and_says_what_it_is(tmp_path) -> None:
     page = saved(tmp_path, title="</script><b>&")
     assert not re.search(r"(src|href)\s*=|https?://|@import|fetch\(|XMLHttpRequest", page)

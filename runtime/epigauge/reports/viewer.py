@@ -27,6 +27,8 @@ _PYRAMID = (0.06, 0.4)  # length of a camera, in usual distances of a point from
 _ELLIPSOID = 0.03  # half-axis of a usual ellipsoid, in usual distances of a point from the middle
 _DOT = (2.0, 5.5)  # diameter of a point, in pixels of the screen
 _STRAY = 0.005  # share of the points left out at either end when the view is fitted
+# As many are left out where what remains is so much smaller: a background seen past the scene.
+_BACKGROUND, _SMALLER = 0.1, 0.4
 _FITTED = 500  # points that the view is fitted to
 
 
@@ -221,6 +223,9 @@ def _without_strays(X: Array) -> Array:
     if not len(X):
         return X
     low, high = np.quantile(X, (_STRAY, 1.0 - _STRAY), axis=0)
+    core = np.quantile(X, (_BACKGROUND, 1.0 - _BACKGROUND), axis=0)
+    if np.ptp(core, axis=0).max() < _SMALLER * np.max(high - low):
+        low, high = core
     return np.asarray(X[((X >= low) & (X <= high)).all(axis=1)])
 
 
