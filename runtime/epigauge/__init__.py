@@ -62,8 +62,9 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge.multi_view.line_start import triangulate_lines
     from epigauge.multi_view.line_tracks import LineTracks
     from epigauge.multi_view.reconstruction import Reconstruction
+    from epigauge.multi_view.reconstruction_covariance import ReconstructionCovariance
     from epigauge.multi_view.tracks import Tracks
-    from epigauge.multi_view.uncertainty import ReconstructionCovariance, covariance
+    from epigauge.multi_view.uncertainty import covariance
     from epigauge.scenes import MultiViewScene, TwoViewScene, multi_view_scene, two_view_scene
     from epigauge.two_view.batch import BATCH_STATUS, FundamentalBatch, refine_fundamental_batch
     from epigauge.two_view.calibrated import estimate_essential
@@ -204,7 +205,8 @@ _WHERE = {
     "multi_view.line_tracks": "LineTracks",
     "multi_view.reconstruction": "Reconstruction",
     "multi_view.tracks": "Tracks",
-    "multi_view.uncertainty": "ReconstructionCovariance covariance",
+    "multi_view.reconstruction_covariance": "ReconstructionCovariance",
+    "multi_view.uncertainty": "covariance",
     "scenes": "MultiViewScene TwoViewScene multi_view_scene two_view_scene",
     "two_view.batch": "BATCH_STATUS FundamentalBatch refine_fundamental_batch",
     "two_view.calibrated": "estimate_essential",

@@ -21,8 +21,8 @@ from epigauge.metric.result import MetricUpgrade
 from epigauge.multi_view.display import display
 from epigauge.multi_view.line_tracks import LineTracks
 from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.reconstruction_covariance import ReconstructionCovariance
 from epigauge.multi_view.tracks import Tracks
-from epigauge.multi_view.uncertainty import ReconstructionCovariance
 from epigauge.plots._style import BLUE, GREY, RED, count_whole, finish, heading, new_figure
 from epigauge.plots.many_views import plot_bundle
 from epigauge.plots.precision import plot_precision
