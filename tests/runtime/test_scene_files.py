@@ -422,6 +422,15 @@ def test_a_binary_file_cut_anywhere_is_refused(tmp_path: Path, good: Path, name:
     assert "announces" in refusal(eg.load_scene, tmp_path)
 
 
+@pytest.mark.parametrize("text", [True, False])
+@pytest.mark.parametrize("lacks", ["rigs", "frames"])
+def test_rigs_without_frames_are_refused(tmp_path: Path, lacks: str, text: bool) -> None:
+    tracks, scene = metric_scene("PINHOLE", visible=1.0)
+    eg.save_scene(tmp_path, tracks, scene, text=text)
+    (tmp_path / f"{lacks}{'.txt' if text else '.bin'}").unlink()
+    assert f"without {lacks}" in refusal(eg.load_scene, tmp_path)
+
+
 def test_folders_and_names_that_are_no_scene_are_refused(tmp_path: Path, good: Path) -> None:
     assert "neither cameras.bin nor cameras.txt" in refusal(eg.load_scene, tmp_path)
     assert "a COLMAP folder, or" in refusal(eg.load_scene, tmp_path / "a.png")

@@ -15,10 +15,14 @@ from epigauge.io.output import writing
 
 def read_folder(path: Path) -> ColmapModel:
     """Read a model, binary where there is one."""
-    if (path / "cameras.bin").exists():  # as COLMAP chooses
-        return read_binary(path)
-    if (path / "cameras.txt").exists():
-        return read_text_model(path)
+    for suffix, read in ((".bin", read_binary), (".txt", read_text_model)):  # as COLMAP chooses
+        if (path / f"cameras{suffix}").exists():
+            names = [f"{name}{suffix}" for name in ("rigs", "frames")]
+            there = [name for name in names if (path / name).exists()]
+            if len(there) == 1:
+                (lacks,) = set(names) - set(there)
+                raise FileFormatError(path, f"holds {there[0]} without {lacks}")
+            return read(path)
     raise FileFormatError(path, "is no COLMAP model: it holds neither cameras.bin nor cameras.txt")
 
 
