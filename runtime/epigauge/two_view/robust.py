@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
-from functools import cache, partial
+from functools import cached_property, partial
 from types import SimpleNamespace
 from typing import Any, ClassVar, Literal, NamedTuple, Unpack
 
@@ -19,7 +19,7 @@ from epigauge._options import FrontEnd, RefineOptions, known_options
 from epigauge.errors import ArgumentError
 from epigauge.two_view import quick
 from epigauge.two_view.chance import chance_agreement
-from epigauge.two_view.conditioning import condition
+from epigauge.two_view.conditioning import Conditioning, condition
 from epigauge.two_view.confidence import Confidence, Signs, probability_below
 from epigauge.two_view.consensus import RANGE, WIDEST, Agreement, Consensus
 from epigauge.two_view.copies import earliest
@@ -244,114 +244,206 @@ def estimated(
     threshold = None if threshold_px == "auto" else as_positive("threshold_px", threshold_px)
     if "F0" in options:
         raise ArgumentError("F0", "is given", "refine_fundamental, which starts from it")
-
     promise = None if score is None else as_score(score, len(x1))
+    options.setdefault("noise_px", None)
+    raw = _Raw.of(x1, x2, options, least)
 
-    first = earliest(x1, x2)
-    rows = np.flatnonzero(first == np.arange(len(x1)))
-    if len(rows) < least:
-        raise ArgumentError("x1, x2", f"hold {len(rows)} different matches", f"at least {least}")
-    copies = np.searchsorted(rows, first)
-    promise = promise if promise is None else promise[rows]
-    y1, y2 = x1[rows], x2[rows]
-
-    frame = condition(y1, y2)
-    table, q = kernels.table(options.get("backend")), frame.forward(y1, y2)
-    consensus = Consensus(table, *q)
+    consensus, frame = raw.consensus, raw.frame
     given = None if threshold is None else threshold / frame.scale
-    if len(rows) >= 8:
-        name, agreement = start(consensus, table, front_end, given, promise, seed)
+    if len(raw.rows) >= 8:
+        promise = promise if promise is None else promise[raw.rows]
+        name, agreement = start(consensus, raw.table, front_end, given, promise, seed)
     if calibration is not None:
         maps = zip(frame.maps_from_pixels(), calibration, strict=True)
-        consensus = EssentialConsensus(table, *q, *(to_units @ K for to_units, K in maps))
-        if len(rows) < 8:
+        cameras = (to_units @ K for to_units, K in maps)
+        consensus = EssentialConsensus(raw.table, *raw.q, *cameras)
+        raw = replace(raw, consensus=consensus)
+        if len(raw.rows) < 8:
             name, agreement = "5point", consensus.of_few()
         agreement = consensus.search([agreement], np.random.default_rng(seed))
 
-    options.setdefault("noise_px", None)
-    limit = threshold / frame.scale if threshold is not None else _at_most(agreement.mixture.even)
-    inlier = _at_least(least, agreement, limit)
+    fit = _fitted(raw, agreement, given, options)
+    known = {
+        "inlier": (fit.inlier if fit.is_open else fit.used)[raw.copies],
+        "used": raw.rows[fit.used],
+        "threshold_px": fit.limit_px,
+        "rounds": fit.rounds,
+        "start": name,
+    }
+    plain = options["noise_px"] is None and options.get("loss", "linear") == "linear"
+    weights = of_matches(options, raw.count, raw.rows).get("weights")
+    weights = np.ones(len(raw.rows)) if weights is None else np.asarray(weights, float)
+    asked = _Asked(raw, weights, fit, given is not None, fit.limit_px if plain else None)
+    later = dict.fromkeys(("flags", "success"), asked.judged)
+    later |= dict.fromkeys(("error_px", "p_wrong", "_signs"), asked.confident)
+    return Estimate(
+        RobustResult.partial(known | _cheap(fit.refined), lambda: asked.rest, **later),
+        frame.scale * fit.agreement.signed[raw.copies],
+    )
+
+
+@dataclass(frozen=True)
+class _Raw:
+    """All different matches, in pixels and conditioned.
+
+    Attributes
+    ----------
+    count : int
+        Matches as they were given.
+    rows, copies : ndarray of int
+        Which of these are here, shape (m,), and which of them each is, shape (count,).
+    x1, x2 : ndarray, shape (m, 2)
+        In pixels.
+    table : Table
+        Backend.
+    frame : Conditioning
+        Conditioned coordinates.
+    q : tuple of ndarray
+        The matches there.
+    consensus : Consensus
+        Of these.
+    least : int
+        How many are needed.
+    """
+
+    count: int
+    rows: NDArray[np.intp]
+    copies: NDArray[np.intp]
+    x1: Array
+    x2: Array
+    table: kernels.Table
+    frame: Conditioning
+    q: tuple[Array, Array]
+    consensus: Consensus
+    least: int
+
+    @staticmethod
+    def of(x1: Array, x2: Array, options: dict[str, Any], least: int) -> _Raw:
+        """Leave out copies, and refuse too few others."""
+        first = earliest(x1, x2)
+        rows = np.flatnonzero(first == np.arange(len(x1)))
+        if len(rows) < least:
+            raise ArgumentError(
+                "x1, x2", f"hold {len(rows)} different matches", f"at least {least}"
+            )
+        copies, m = np.searchsorted(rows, first), len(x1)
+        x1, x2 = x1[rows], x2[rows]
+        frame, table = condition(x1, x2), kernels.table(options.get("backend"))
+        q = frame.forward(x1, x2)
+        consensus = Consensus(table, *q)
+        return _Raw(m, rows, copies, x1, x2, table, frame, q, consensus, least)
+
+
+class _Fit(NamedTuple):
+    """F of the inliers that stand still, in conditioned coordinates but for `refined`."""
+
+    refined: FundamentalResult
+    agreement: Agreement
+    used: Mask
+    inlier: Mask
+    limit: float
+    limit_px: float
+    rounds: int
+    is_open: bool
+
+
+def _fitted(raw: _Raw, agreement: Agreement, given: float | None, options: dict[str, Any]) -> _Fit:
+    """Refine F by its inliers until they stand still, within a distance that may be given."""
+    scale = raw.frame.scale
+    limit = _at_most(agreement.mixture.even) if given is None else given
+    inlier = _at_least(raw.least, agreement, limit)
     fitted: set[bytes] = set()
     is_open = False
     while not is_open and inlier.tobytes() not in fitted and len(fitted) < _ROUNDS:
         fitted.add(inlier.tobytes())
-        used, limit_px = inlier, limit * frame.scale
-        F0: Array | None = frame.to_pixels(agreement.F)
+        used, limit_px = inlier, limit * scale
+        F0: Array | None = raw.frame.to_pixels(agreement.F)
         while True:
-            chosen = of_matches(options, len(x1), rows[used])
+            chosen = of_matches(options, raw.count, raw.rows[used])
             try:
-                refined = refine_fundamental(y1[used], y2[used], F0, **chosen)
+                refined = refine_fundamental(raw.x1[used], raw.x2[used], F0, **chosen)
                 break
             except ArgumentError as error:
                 if is_open or error.argument not in ("x1", "x2", "F0"):
                     raise
             # All that agree are in one place or on one line, and leave F open: fitted to all
-            used, F0, is_open = np.ones(len(rows), np.bool_), None, True
-        F = frame.from_pixels(refined.F)
-        signed, oriented = consensus.measured(F)
+            used, F0, is_open = np.ones(len(raw.rows), np.bool_), None, True
+        F = raw.frame.from_pixels(refined.F)
+        signed, oriented = raw.consensus.measured(F)
         agreement = replace(agreement, F=F, signed=signed, oriented=oriented)
-        if threshold is None:
+        if given is None:
             sigma = robust_scale(agreement.signed[used])
             limit = min(limit, max(_DEVIATIONS * sigma, 1e-9))
-        inlier = _at_least(least, agreement, limit)
-    plain = options["noise_px"] is None and options.get("loss", "linear") == "linear"
-    known = {
-        "inlier": (inlier if is_open else used)[copies],
-        "used": rows[used],
-        "threshold_px": limit_px,
-        "rounds": len(fitted),
-        "start": name,
-    }
-    weights = of_matches(options, len(x1), rows).get("weights")
-    raw = _Raw(y1, y2, np.ones(len(y1)) if weights is None else np.asarray(weights, float))
+        inlier = _at_least(raw.least, agreement, limit)
+    return _Fit(refined, agreement, used, inlier, limit, limit_px, len(fitted), is_open)
 
-    @cache
-    def near() -> tuple[Agreement, float, Mask]:
-        agreed, bound = agreement, limit
-        if threshold is None:  # real noise has heavier tails than three deviations of its core
-            agreed = consensus.judge(agreement.F, agreement.sigma, agreement.share)
-            bound = max(limit, _at_most(agreed.mixture.even))
+
+@dataclass(frozen=True)
+class _Asked:
+    """What is computed of a fit when it is asked for.
+
+    Attributes
+    ----------
+    raw, weights, fit
+        The matches, their weights (m,), and what was fitted.
+    is_limited : bool
+        Whether the caller gave the largest distance of an inlier.
+    cut_px : float or None
+        Where the noise is to be known without the cut that the largest distance makes.
+    """
+
+    raw: _Raw
+    weights: Array
+    fit: _Fit
+    is_limited: bool
+    cut_px: float | None
+
+    @cached_property
+    def near(self) -> tuple[Agreement, float, Mask]:
+        """The agreement of all, the distance up to which a match agrees, and which do."""
+        agreed, bound = self.fit.agreement, self.fit.limit
+        if not self.is_limited:  # real noise has heavier tails than three deviations of its core
+            agreed = self.raw.consensus.judge(agreed.F, agreed.sigma, agreed.share)
+            bound = max(bound, _at_most(agreed.mixture.even))
         return agreed, bound, agreed.inliers(bound)  # where fewer than 8, "no common geometry"
 
-    @cache
-    def among_all() -> Evidence:
-        _, bound, agreeing = near()
-        weights = raw.weights
-        return refined._evidence.among(raw.x1, raw.x2, weights, agreeing, bound * frame.scale)
+    @cached_property
+    def among_all(self) -> Evidence:
+        """The evidence of all matches."""
+        _, bound, agreeing = self.near
+        raw, own = self.raw, self.fit.refined._evidence
+        return own.among(raw.x1, raw.x2, self.weights, agreeing, bound * raw.frame.scale)
 
-    def judged() -> SimpleNamespace:
-        agreed, bound, agreeing = near()
+    def judged(self) -> SimpleNamespace:
+        """Return flags and success."""
+        raw, is_open, refined = self.raw, self.fit.is_open, self.fit.refined
+        agreed, bound, agreeing = self.near
         pair = vars(refined).get("_pair")
         if pair is not None and not is_open:  # cheap tests, where they suffice
+            scale = raw.frame.scale
             flags, success = quick.verdict_of_raw(
-                *(pair, (raw.x1, raw.x2, raw.weights), frame.scale * agreed.signed, agreeing),
-                bound * frame.scale,
-                partial(chance_agreement, table, agreed.F, *q, bound),
+                *(pair, (raw.x1, raw.x2, self.weights), scale * agreed.signed, agreeing),
+                bound * scale,
+                partial(chance_agreement, raw.table, agreed.F, *raw.q, bound),
             )
             if flags is not None:
                 return SimpleNamespace(flags=flags, success=success)
-        verdict = refined.judged(among_all())
+        verdict = refined.judged(self.among_all)
         if is_open:
-            verdict = SimpleNamespace(
-                flags=ordered((*verdict.flags, "undetermined")), success=False
-            )
+            flags = ordered((*verdict.flags, "undetermined"))
+            verdict = SimpleNamespace(flags=flags, success=False)
         return verdict
 
-    @cache
-    def rest() -> SimpleNamespace:
-        return _rest(refined, limit_px if plain else None)
+    @cached_property
+    def rest(self) -> SimpleNamespace:
+        """All fields but those above."""
+        return _rest(self.fit.refined, self.cut_px)
 
-    def confident() -> SimpleNamespace:
-        alarms = log10_alarms(among_all())
-        signs = Signs.of(rest()._uncertainty, y1[used], y2[used], alarms)
+    def confident(self) -> SimpleNamespace:
+        """Return how likely the geometry is that of the scene."""
+        alarms, used = log10_alarms(self.among_all), self.fit.used
+        signs = Signs.of(self.rest._uncertainty, self.raw.x1[used], self.raw.x2[used], alarms)
         return SimpleNamespace(_signs=signs, **vars(Confidence.of(signs)))
-
-    later = dict.fromkeys(("flags", "success"), judged)
-    later |= dict.fromkeys(("error_px", "p_wrong", "_signs"), confident)
-    return Estimate(
-        RobustResult.partial(known | _cheap(refined), rest, **later),
-        frame.scale * agreement.signed[copies],
-    )
 
 
 class Estimate(NamedTuple):
@@ -381,15 +473,6 @@ def _rest(refined: FundamentalResult, limit_px: float | None) -> SimpleNamespace
         known |= {"noise_px": noise_px, "_uncertainty": spread}
         known["covariance"] = spread.of_fundamental()
     return SimpleNamespace(**known)
-
-
-@dataclass(frozen=True)
-class _Raw:
-    """All different matches in pixels, and their weights."""
-
-    x1: Array
-    x2: Array
-    weights: Array
 
 
 def _at_least(count: int, agreement: Agreement, limit: float) -> Mask:
