@@ -23,6 +23,7 @@ __all__ = [
     "GaugeMode",
     "GaugeName",
     "Hessian",
+    "HomographyOptions",
     "Initialization",
     "Loss",
     "Method",
@@ -108,6 +109,23 @@ class RefineOptions(PairOptions, total=False):
     """Options of `refine_fundamental`, but for `F0`."""
 
     weights: ArrayLike | None
+
+
+class HomographyOptions(TypedDict, total=False):
+    """Options of `refine_homography`, but for `H0`."""
+
+    loss: Loss
+    loss_scale_px: float | Literal["auto"]
+    noise_px: float | None
+    weights: ArrayLike | None
+    covariance1: ArrayLike | None
+    covariance2: ArrayLike | None
+    ftol: float
+    xtol: float
+    gtol: float
+    max_iter: int
+    backend: Backend | None
+    callback: Callable[[Row], object] | None
 
 
 class AdjustOptions(TypedDict, total=False):

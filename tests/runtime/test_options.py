@@ -43,6 +43,7 @@ def test_checkers_know_the_names_that_solvers_know(name: str) -> None:
     ("form", "function", "apart"),
     [
         ("RefineOptions", eg.refine_fundamental, {"x1", "x2", "F0"}),
+        ("HomographyOptions", eg.refine_homography, {"x1", "x2", "H0"}),
         ("PairOptions", eg.refine_fundamental, {"x1", "x2", "F0", "weights"}),
         ("AdjustOptions", eg.bundle_adjust, {"tracks", "start", "method", "lines"}),
     ],

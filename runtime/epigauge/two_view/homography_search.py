@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from epigauge import kernels
 from epigauge._arguments import as_count, as_matches, as_positive, as_score
 from epigauge._logged import logged
+from epigauge._options import HomographyOptions, known_options
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 from epigauge.two_view.chance import CEILING, SIGNIFICANT, chance_on_plane, log10_false_alarms
@@ -119,7 +120,7 @@ def estimate_homography(
     threshold_px: float | Literal["auto"] = "auto",
     score: ArrayLike | None = None,
     seed: int = 0,
-    **options: Any,
+    **options: Unpack[HomographyOptions],
 ) -> HomographyResult:
     """Find the homography of raw matches, gross errors and points off the plane among them.
 
@@ -166,7 +167,8 @@ def estimate_homography(
     >>> bool(inlier[::3].any()), int(np.count_nonzero(inlier))
     (False, 66)
     """
-    if "H0" in options:
+    known = known_options("estimate_homography", options, HomographyOptions, ("H0",))
+    if "H0" in known:
         raise ArgumentError("H0", "is given", "refine_homography, which starts from it")
     x1, x2 = as_matches(x1, x2, at_least=LEAST, general_position=True)
     seed = as_count("seed", seed, at_least=0)
@@ -179,7 +181,7 @@ def estimate_homography(
     copies = np.searchsorted(rows, first)
     y1, y2 = x1[rows], x2[rows]
     frame = condition(y1, y2)
-    table, (q1, q2) = kernels.table(options.get("backend")), frame.forward(y1, y2)
+    table, (q1, q2) = kernels.table(known.get("backend")), frame.forward(y1, y2)
     order = ranked(table, q1, q2)
     if promise is not None:
         order = np.argsort(-promise[rows], kind="stable")
@@ -203,7 +205,7 @@ def estimate_homography(
         H0: Array | None = frame.homography_to_pixels(H)
         used = inlier
         while True:
-            chosen = of_matches(options, len(x1), rows[used])
+            chosen = of_matches(known, len(x1), rows[used])
             try:
                 result = refine_homography(y1[used], y2[used], H0, **chosen)
                 break
@@ -220,7 +222,7 @@ def estimate_homography(
     alarms = log10_false_alarms(len(rows), agreed, chance, LEAST)
     is_left_open = is_open or is_plane_left_open(table, H, q1, q2, used, bound)
     flags = ("no common geometry",) * bool(alarms > SIGNIFICANT) + ("undetermined",) * is_left_open
-    if threshold is None and options.get("noise_px") is None and np.isfinite(result.noise_px):
+    if threshold is None and known.get("noise_px") is None and np.isfinite(result.noise_px):
         tails = 1.0 / math.sqrt(_KEPT)  # the threshold has cut them off
         result = replace(
             result, noise_px=result.noise_px * tails, covariance=result.covariance * tails**2
