@@ -52,7 +52,7 @@ class Constants:
     power: float
 
 
-FITTED = Constants(factor=0.979, unmodelled=2.1e-4, width=0.336, odds=-0.944, power=0.662)
+FITTED = Constants(factor=0.98, unmodelled=2.09e-4, width=0.338, odds=-0.783, power=0.7)
 
 
 @dataclass(frozen=True)
