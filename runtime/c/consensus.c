@@ -1,4 +1,4 @@
-/* The likelihood of all matches: right distances are normal, wrong ones uniform.
+/* The likelihood of all matches: right distances are normal, wrong ones wide or uniform.
 
    The reference is runtime/epigauge/two_view/consensus.py, which also says what the numbers mean. */
 #include "small.h"
@@ -92,49 +92,80 @@ static ptrdiff_t counted(ptrdiff_t m, const double *signed_, const unsigned char
     return n;
 }
 
-/* Share and deviation of right matches by expectation and maximisation, from those in `fitted`, and
-   the logarithm of the likelihood. As `Consensus.judge`. */
-static void fit(ptrdiff_t n, ptrdiff_t others, const double *squared,
-                const eg_mixture_options *options, double *right, double *fitted)
+/* What is fitted: deviation and share of right matches, the logarithm of the likelihood, share and
+   spread of the wrong matches near. As the fields of `Judged`. */
+enum { SIGMA, SHARE, SCORE, NEAR, SPREAD, FITTED };
+
+/* Densities of right and of near matches over that of those anywhere, at a squared distance. */
+typedef struct {
+    double gain, by, halo, halo_by, anywhere;
+} ratios;
+
+static ratios ratios_of(const double *fitted, double extent)
 {
-    double sigma = fitted[0], share = fitted[1];
-    const double extent = options->extent;
+    const double anywhere = fmax(1.0 - fitted[SHARE] - fitted[NEAR], 1e-4) / extent;
+    const double sigma = fitted[SIGMA], spread = fitted[SPREAD];
+    return (ratios){fitted[SHARE] / (sigma * ROOT_TWO_PI * anywhere), -0.5 / (sigma * sigma),
+                    fitted[NEAR] / (spread * ROOT_TWO_PI * anywhere), -0.5 / (spread * spread),
+                    anywhere};
+}
+
+/* Fit by expectation and maximisation, from the values given; right and halo have room (n). As
+   `Consensus.judge`. */
+static void fit(ptrdiff_t n, ptrdiff_t others, const double *squared,
+                const eg_mixture_options *options, double *right, double *halo, double *fitted)
+{
+    double next[FITTED];
+    const double extent = options->extent, all = (double)(n + others);
     int first = 1;
+    memcpy(next, fitted, sizeof next);
+    if (!(next[NEAR] > 0.0))
+        for (ptrdiff_t i = 0; i < n; ++i)
+            halo[i] = 0.0;
     for (;;) {
-        const double peak = share / (sigma * ROOT_TWO_PI);
-        const double wrong = (1.0 - share) / extent, odds = wrong / peak;
-        const double by = -0.5 / (sigma * sigma), gain = 1.0 / odds;
-        double logs = 0.0, count = 0.0, squares = 0.0;
+        const ratios at = ratios_of(next, extent);
+        double logs = 0.0, count = 0.0, squares = 0.0, around = 0.0, widths = 0.0;
         EG_SIMD
         for (ptrdiff_t i = 0; i < n; ++i)
-            right[i] = gain * exponential(by * squared[i]);
+            right[i] = at.gain * exponential(at.by * squared[i]);
+        if (next[NEAR] > 0.0) {
+            EG_SIMD
+            for (ptrdiff_t i = 0; i < n; ++i)
+                halo[i] = at.halo * exponential(at.halo_by * squared[i]);
+        }
         for (ptrdiff_t begin = 0; begin < n; begin += CHUNK) {
             const ptrdiff_t end = n - begin < CHUNK ? n : begin + CHUNK;
             double product = 1.0;
             for (ptrdiff_t i = begin; i < end; ++i)
-                product *= 1.0 + right[i];
+                product *= 1.0 + right[i] + halo[i];
             logs += logarithm(product);
         }
-        const double all = (double)(n + others);
-        const double score = all * logarithm(wrong) + logs - 7.0 * logarithm(extent / sigma);
-        if (!first && !(score > fitted[2] + options->climbed))
+        next[SCORE] = all * logarithm(at.anywhere) + logs - 7.0 * logarithm(extent / next[SIGMA]);
+        if (!first && !(next[SCORE] > fitted[SCORE] + options->climbed))
             return;
         first = 0;
-        fitted[0] = sigma;
-        fitted[1] = share;
-        fitted[2] = score;
-        EG_SUM(count, squares)
+        memcpy(fitted, next, sizeof next);
+        EG_SUM(count, squares, around, widths)
         for (ptrdiff_t i = 0; i < n; ++i) {
-            const double p = right[i] / (1.0 + right[i]);
+            const double by = 1.0 / (1.0 + right[i] + halo[i]);
+            const double p = right[i] * by, near = halo[i] * by;
             count += p;
             squares += p * squared[i];
+            around += near;
+            widths += near * squared[i];
         }
-        share = fmin(fmax(count / fmax(all, 1.0), options->least), options->most);
-        sigma = fmin(fmax(sqrt(squares / fmax(count - 7.0, 1.0)), options->floor), options->widest);
+        next[SHARE] = fmin(fmax(count / fmax(all, 1.0), options->least), options->most);
+        next[SIGMA] = fmin(fmax(sqrt(squares / fmax(count - 7.0, 1.0)), options->floor),
+                           options->widest);
+        if (next[NEAR] > 0.0) {
+            next[NEAR] = fmin(around / fmax(all, 1.0), options->most - next[SHARE]);
+            next[SPREAD] = fmax(sqrt(widths / fmax(around, 1e-300)),
+                                options->halo * next[SIGMA]);
+        }
     }
 }
 
-/* Distances and sides, and the fit where there is one; room has 2 m doubles. */
+/* Distances and sides, and the fit where there is one; room has 3 m doubles. */
 static void judge(ptrdiff_t m, const double *q1, const double *q2,
                   const eg_mixture_options *options, const double *F, double *fitted,
                   double *distances, unsigned char *oriented, double *room)
@@ -149,18 +180,17 @@ static void judge(ptrdiff_t m, const double *q1, const double *q2,
                       fabs(distances[i]) < 1.0 / options->floor;
     if (fitted) {
         const ptrdiff_t n = counted(m, distances, oriented, options, room, &others);
-        fit(n, others, room, options, room + m, fitted);
+        fit(n, others, room, options, room + m, room + 2 * m, fitted);
     }
 }
 
 /* Signed distances (m) of matches q1, q2 (2, m) to F, which of them are oriented, and where asked
-   for deviation, share and score (3), fitted from the first two of these. Returns 0 where memory
-   ran out. */
+   for what is fitted (5), from the values given but the score. Returns 0 where memory ran out. */
 EG_EXPORT int eg_judge(ptrdiff_t m, const double *F, const double *q1, const double *q2,
                        const eg_mixture_options *options, double *fitted, double *distances,
                        unsigned char *oriented)
 {
-    double *room = malloc((size_t)(2 * m + 1) * sizeof *room);
+    double *room = malloc((size_t)(3 * m + 1) * sizeof *room);
     if (!room)
         return 0;
     judge(m, q1, q2, options, F, fitted, distances, oriented, room);
@@ -176,13 +206,14 @@ static int refitted(eg_matches *matches, const eg_mixture_options *options, cons
     static const eg_chart chart = {7, NULL, NULL};
     const eg_options how = {EG_REPROJECTION, EG_BLOCKS, EG_LINEAR, 1, 0, options->steps, 1.0,
                             options->ftol, 1e-12, 1e-14, 0.0, 0.0};
-    const double by = -0.5 / (fitted[0] * fitted[0]), share = fitted[1];
-    const double odds = (1.0 - share) / options->extent * fitted[0] * ROOT_TWO_PI / share;
+    const ratios at = ratios_of(fitted, options->extent);
     double motion[EG_MOTION] = {0.0}, sigma;
     eg_outcome outcome;
     for (ptrdiff_t i = 0; i < matches->m; ++i) {
-        const double p = oriented[i] ? exponential(by * distances[i] * distances[i]) : 0.0;
-        matches->weights[i] = p / (p + odds);
+        const double squared = distances[i] * distances[i];
+        const double p = oriented[i] ? at.gain * exponential(at.by * squared) : 0.0;
+        const double near = at.halo > 0.0 ? at.halo * exponential(at.halo_by * squared) : 0.0;
+        matches->weights[i] = p / (1.0 + p + near);
     }
     if (!eg_factorize(from, motion, motion + 9, &sigma))
         return 0;
@@ -199,11 +230,11 @@ EG_EXPORT int eg_climb(ptrdiff_t m, const double *q1, const double *q2,
                        const eg_mixture_options *options, double *F, double *fitted,
                        double *distances, unsigned char *oriented)
 {
-    double *room = malloc((size_t)(10 * m + 1) * sizeof *room);
+    double *room = malloc((size_t)(11 * m + 1) * sizeof *room);
     unsigned char *sides = malloc((size_t)m + 1);
     if (room && sides) {
         eg_matches matches = {m, room, room + 4 * m, room + 5 * m, room + 6 * m};
-        double *other = room + 7 * m, trial[9], own[3];
+        double *other = room + 7 * m, trial[9], own[FITTED];
         for (ptrdiff_t begin = 0; begin < m; begin += EG_BLOCK) {
             const ptrdiff_t n = eg_block_size(&matches, begin);
             double *q = eg_block_points(&matches, begin);
@@ -217,7 +248,7 @@ EG_EXPORT int eg_climb(ptrdiff_t m, const double *q1, const double *q2,
                 break;
             memcpy(own, fitted, sizeof own);
             judge(m, q1, q2, options, trial, own, other, sides, room + 8 * m);
-            if (!(own[2] > fitted[2] + options->climbed))
+            if (!(own[SCORE] > fitted[SCORE] + options->climbed))
                 break;
             memcpy(F, trial, sizeof trial);
             memcpy(fitted, own, sizeof own);

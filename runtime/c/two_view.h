@@ -120,6 +120,7 @@ typedef struct {
     double extent, range;         /* distances that count, all where it is the range of them */
     double widest, floor;         /* of the deviation */
     double least, most;           /* of the share */
+    double halo;                  /* least spread of wrong matches near, over the deviation */
     double climbed, ftol;         /* gain of the likelihood, and of the cost of a fit, that ends */
     int climbs, steps;            /* at most, and of a fit */
 } eg_mixture_options;

@@ -11,7 +11,7 @@ from epigauge import kernels
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.criteria import CRITERIA, Mahalanobis
 from epigauge.two_view.eliminated import EliminatedProblem
-from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, Mixture, median, robust_scale
+from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, median, robust_scale
 from epigauge.two_view.parameterizations import Block, Ortho
 from laws import assert_jacobian, central_differences, distance
 from two_views import same_geometry
@@ -22,8 +22,7 @@ SQUARES = np.array([0.0, 0.01, 0.3, 0.9, 1.2, 3.0, 40.0]) + 0.02
 
 def loss_cases():
     """Return every loss, at two scales."""
-    losses = [Loss(name, scale) for name in LOSSES for scale in (1.0, 0.7)]
-    return losses + [Mixture.of(s, share, 7.0) for s in (0.3, 0.6) for share in (0.5, 0.9)]
+    return [Loss(name, scale) for name in LOSSES for scale in (1.0, 0.7)]
 
 
 @pytest.mark.parametrize("loss", loss_cases(), ids=str)
@@ -79,14 +78,13 @@ def robust_problem(criterion: str, name: str, chart):
     right, wrong = np.sort(np.abs(distances.evaluate(F).signed))[15:17]
     assert right < 0.5 * wrong
     scale = float(np.sqrt(right * wrong))
-    loss = Mixture.of(scale / 2.0, 0.8, 7.0) if name == "mixture" else Loss(name, scale)
     weights = np.random.default_rng(0).uniform(0.5, 2.0, 20)
-    problem = EliminatedProblem(distances, chart(table), weights, loss, True)
+    problem = EliminatedProblem(distances, chart(table), weights, Loss(name, scale), True)
     return problem, problem.evaluate(problem.start(F))
 
 
 @pytest.mark.parametrize("chart", [Ortho, Block])
-@pytest.mark.parametrize("name", [*LOSSES, "mixture"])
+@pytest.mark.parametrize("name", LOSSES)
 @pytest.mark.parametrize("criterion", CRITERIA)
 def test_gradient_and_exact_hessian_are_those_of_the_robust_cost(criterion, name, chart):
     problem, state = robust_problem(criterion, name, chart)

@@ -14,6 +14,7 @@ from epigauge.errors import MissingPackageError
 from epigauge.two_view import diagnostics
 from epigauge.two_view.conditioning import condition
 from epigauge.two_view.consensus import Consensus
+from epigauge.two_view.mixture import Mixture
 from epigauge.two_view.planes import _is_accidental, chance_pairs
 from two_views import same_geometry
 
@@ -450,3 +451,62 @@ def test_a_geometry_without_distances_ends_the_search() -> None:
         result = eg.estimate_fundamental(unit * X / z + 320.0, unit * X / (z + 0.05) + 320.0)
         assert np.isfinite(result.F).all()
         assert "few matches" in result.flags
+
+
+# ---------------------------------------------------------------- wrong matches near right ones
+
+
+def beside(seed: int = 0, m: int = 80, wrong: int = 38):
+    """Return a scene whose wrong matches are normal about the right point, 8 px wide."""
+    scene = eg.two_view_scene(n_points=m, distance=4.0, noise_px=0.3, seed=seed)
+    rng = np.random.default_rng(200 + seed)
+    x2 = scene.x2.copy()
+    x2[:wrong] += 8.0 * rng.standard_normal((wrong, 2))
+    return scene, scene.x1, x2
+
+
+@pytest.mark.parametrize("seed", [0, 6, 7])
+def test_wrong_matches_beside_the_right_point_are_not_taken_for_noise(seed):
+    scene, x1, x2 = beside(seed)
+    result = eg.estimate_fundamental(x1, x2)
+    assert error(result.F, scene) < 0.5
+    assert result.threshold_px < 2.0
+    assert result.inlier[38:].mean() > 0.8
+
+
+def test_normal_distances_have_no_wrong_ones_about_them():
+    # Nothing is gained by a core and what is around it: the noise stays that of all.
+    for seed in range(3):
+        _, x1, x2, right = spoilt(60, noise_px=3.0, seed=seed)
+        result = eg.estimate_fundamental(x1, x2)
+        assert result.noise_px == pytest.approx(3.0, rel=0.3)
+        assert np.mean(result.inlier[right]) > 0.9
+
+
+@pytest.mark.parametrize("about", [(0.0, 1.0), (0.2, 0.4)])
+def test_compiled_and_numpy_mixtures_are_the_same(about):
+    if kernels.available()["c"]:
+        pytest.skip("no compiled library")
+    scene, x1, x2 = beside()
+    frame = condition(x1, x2)
+    q = frame.forward(x1, x2)
+    one, other = (Consensus(kernels.table(name), *q) for name in ("c", "numpy"))
+    F = frame.from_pixels(scene.F_true)
+    a, b = (c.judge(F, 0.01, about=about) for c in (one, other))
+    for name in ("sigma", "share", "score", "near", "spread"):
+        assert getattr(a, name) == pytest.approx(getattr(b, name), rel=1e-7)
+    assert (a.near > 0.1) == (about[0] > 0.0)
+    a, b = one.climb(a), other.climb(b)
+    assert a.score == pytest.approx(b.score, rel=1e-6)
+    assert a.mixture.even == pytest.approx(b.mixture.even, rel=1e-3)
+
+
+def test_mixture_is_a_density_and_even_parts_it():
+    for mixture in (Mixture(0.02, 0.6, 7.0), Mixture(0.02, 0.5, 7.0, 0.3, 0.3)):
+        d = np.linspace(0.0, 40.0 * mixture.spread, 2_000_001)
+        total, right, near = mixture.parts(d**2)
+        # Normal parts have both signs of a distance.
+        assert 2.0 * np.trapezoid(right, d) == pytest.approx(mixture.share, rel=1e-4)
+        assert 2.0 * np.trapezoid(near, d) == pytest.approx(mixture.near, rel=1e-4, abs=1e-12)
+        assert total - right - near == pytest.approx((1 - mixture.share - mixture.near) / 7.0)
+        assert mixture.right(np.array(mixture.even**2)) == pytest.approx(0.5, abs=1e-6)

@@ -4,6 +4,10 @@ The exact distances of right matches are normal with an unknown standard deviati
 ones uniform over the image, and the share of right ones is unknown too: the likelihood of all
 matches under this mixture says how good a geometry is, without any threshold. It has many local
 maxima; they are climbed from starts that subsets of the right matches give.
+
+Wrong matches that a matcher has left are not uniform, though: many are a little beside the right
+point. One normal distribution then takes right and wrong ones for right ones of much noise. A part
+of the wrong matches may therefore be normal about the epipolar lines, too, but wide.
 """
 
 from __future__ import annotations
@@ -23,7 +27,8 @@ from epigauge.two_view.chance import CEILING, chance_agreement, log10_false_alar
 from epigauge.two_view.conditioning import RMS
 from epigauge.two_view.criteria import Reprojection
 from epigauge.two_view.eliminated import EliminatedProblem
-from epigauge.two_view.losses import Loss, Mixture
+from epigauge.two_view.losses import Loss
+from epigauge.two_view.mixture import Mixture
 from epigauge.two_view.parameterizations import Block, Parameterization
 
 __all__ = ["RANGE", "WIDEST", "Agreement", "Consensus"]
@@ -41,6 +46,15 @@ WIDEST = 0.03
 
 #: Standard deviation of the noise, conditioned, below which distances are rounding.
 _FLOOR = 1e-12
+
+#: Wrong matches about the epipolar lines are spread at least so many times as far as right ones:
+#: the tails of these are not taken for them.
+_HALO = 6.0
+
+#: They are believed where that gains so much of the logarithm of the likelihood, what is left is
+#: sharper by a factor, and a good part of those about: a few of many normal distances always are
+#: sharp.
+_WORTH, _SHARPER, _PART = 5.0, 0.5, 0.5
 
 #: The share of right matches stays inside these.
 _SHARES = (0.02, 0.999)
@@ -101,6 +115,8 @@ class Agreement:
         Logarithm of the likelihood, less what any seven matches gain by fitting exactly.
     extent : float
         Largest distance that counts: wrong matches are uniform up to it.
+    near, spread : float
+        Share of wrong matches about the epipolar lines, and standard deviation of their distances.
     """
 
     F: Array
@@ -110,11 +126,18 @@ class Agreement:
     share: float
     score: float
     extent: float = RANGE
+    near: float = 0.0
+    spread: float = 1.0
 
     @property
     def mixture(self) -> Mixture:
         """Return the density of the distances."""
-        return Mixture.of(self.sigma, self.share, self.extent)
+        return Mixture(self.sigma, self.share, self.extent, self.near, self.spread)
+
+    @property
+    def about(self) -> tuple[float, float]:
+        """Return what is known of the wrong matches about the epipolar lines."""
+        return self.near, self.spread
 
     def inliers(self, limit: float) -> Mask:
         """Return which matches are oriented and within a distance."""
@@ -149,35 +172,66 @@ class Consensus:
         """Coefficients (9, few) of the equations of the few matches by vect(F)."""
         return (self.h2[:, None, self.few] * self.h1[None, :, self.few]).reshape(9, -1)
 
-    def judge(self, F: Array, sigma: float, share: float = 0.5, extent: float = RANGE) -> Agreement:
+    def judge(
+        self,
+        F: Array,
+        sigma: float,
+        share: float = 0.5,
+        extent: float = RANGE,
+        about: tuple[float, float] = (0.0, 1.0),
+    ) -> Agreement:
         """Return the agreement with F, sigma and share being fitted from the values given.
 
         Scores are to be compared for one extent only. A small one sees no more of the wrong matches
-        than how dense they are beside the epipolar lines.
+        than how dense they are beside the epipolar lines. For all of them, `about` says so: the
+        share of wrong matches that are near these and how far they are spread, to fit from; none by
+        default.
         """
+        near, spread = about
         if self.criterion.kernels.compiled:
-            judged = mixture_native.judge(*self._q, F, (sigma, share), self._options(extent))
-            return Agreement(*judged, extent)
+            fitted = sigma, share, near, spread
+            return _agreement(
+                mixture_native.judge(*self._q, F, fitted, self._options(extent)), extent
+            )
         signed, oriented = self.measured(F)
         there = np.abs(signed) < 1.0 / _FLOOR
-        near = np.abs(signed) <= extent if extent < RANGE else np.ones(len(signed), np.bool_)
-        squared, counts = np.where(there, signed, 0.0)[near] ** 2, oriented[near]
+        within = np.abs(signed) <= extent if extent < RANGE else np.ones(len(signed), np.bool_)
+        squared, counts = np.where(there, signed, 0.0)[within] ** 2, oriented[within]
         best = None
         while True:
-            mixture = Mixture.of(sigma, share, extent)
-            wrong = np.log((1.0 - share) / extent)
-            logs = np.where(counts, mixture.logarithm(squared), wrong)
+            mixture = Mixture(sigma, share, extent, near, spread)
+            total, right, halo = mixture.parts(squared)
+            logs = np.log(np.where(counts, total, mixture.odds))
             score = float(np.sum(logs)) - 7.0 * float(np.log(extent / sigma))
             # An F that has no distances (NaN) climbs no further.
             if best is not None and not score > best.score + _CLIMBED:
                 return best
-            best = Agreement(F, signed, oriented, sigma, share, score, extent)
-            right = np.where(counts, mixture(squared)[1], 0.0)
-            count = float(np.sum(right))
-            share = float(np.clip(count / max(len(squared), 1), *_SHARES))
+            best = Agreement(F, signed, oriented, sigma, share, score, extent, near, spread)
+            right, halo = (np.where(counts, part / total, 0.0) for part in (right, halo))
+            count, around, every = float(np.sum(right)), float(np.sum(halo)), max(len(squared), 1)
+            share = float(np.clip(count / every, *_SHARES))
             # The seven parameters of F absorb seven squares of the noise
             variance = np.sum(right * squared) / max(count - 7.0, 1.0)
             sigma = min(max(float(np.sqrt(variance)), _FLOOR), self.widest)
+            if near:
+                near = min(around / every, _SHARES[1] - share)
+                widths = np.sum(halo * squared) / max(around, 1e-300)
+                spread = max(float(np.sqrt(widths)), _HALO * sigma)
+
+    def heavier(self, own: Agreement, others: Iterable[Agreement]) -> Agreement:
+        """Return the best agreement with wrong matches about the epipolar lines, if it is better.
+
+        Climbed to from the geometries of all agreements, the first of which is best without these.
+        """
+        starts = []
+        for one in (own, *others):
+            spread = max(float(np.sqrt(one.sigma * RANGE)), _HALO * one.sigma)
+            about = 0.5 * (1.0 - one.share), spread
+            starts.append(self.judge(one.F, one.sigma, one.share, about=about))
+        climbed = (a for a in map(self.climb, starts) if a.share > _PART * a.near)
+        sharp = (a for a in climbed if a.sigma < _SHARPER * own.sigma)
+        best = max(sharp, key=_score, default=own)
+        return best if best.score > own.score + _WORTH else own
 
     def measured(self, F: Array) -> tuple[Array, Mask]:
         """Return exact distances, and which matches can lie in front of both cameras."""
@@ -195,13 +249,13 @@ class Consensus:
         if self.criterion.kernels.compiled and isinstance(self.chart, Block):
             known = mixture_native.Judged(*(getattr(start, name) for name in _JUDGED))
             found = mixture_native.climb(*self._q, known, self._options(RANGE))
-            return start if found.score == start.score else Agreement(*found)
+            return start if found.score == start.score else _agreement(found, RANGE)
         best = start
         for _ in range(_CLIMBS):
             squared = np.where(best.oriented, best.signed, 0.0) ** 2
-            right = np.where(best.oriented, best.mixture(squared)[1], 0.0)
+            right = np.where(best.oriented, best.mixture.right(squared), 0.0)
             F = self.fitted(best.F, right)
-            trial = self.judge(F, best.sigma, best.share, best.extent)
+            trial = self.judge(F, best.sigma, best.share, best.extent, best.about)
             if not trial.score > best.score + _CLIMBED:
                 break
             best = trial
@@ -224,7 +278,7 @@ class Consensus:
         return self.criterion.q1, self.criterion.q2
 
     def _options(self, extent: float) -> mixture_native.MixtureOptions:
-        numbers = (extent, RANGE, self.widest, _FLOOR, *_SHARES, _CLIMBED, _STOPPING.ftol)
+        numbers = (extent, RANGE, self.widest, _FLOOR, *_SHARES, _HALO, _CLIMBED, _STOPPING.ftol)
         return mixture_native.MixtureOptions(*numbers, _CLIMBS, _STOPPING.max_iter)
 
     def search(self, starts: Iterable[Agreement], rng: np.random.Generator) -> Agreement:
@@ -305,7 +359,7 @@ class Consensus:
             order = np.argsort(-np.sum(mixture.logarithm(squared), axis=1))[:keep]
             F = F[order]
             if keep > _CLIMBERS:
-                F, squared = self.linear_fits(mixture(squared[order])[1]), None
+                F, squared = self.linear_fits(mixture.right(squared[order])), None
         return F
 
     def sampson(self, F: Array) -> Array:
@@ -328,6 +382,10 @@ class Consensus:
 
 #: Fields of an agreement that the compiled code knows, in its order.
 _JUDGED = mixture_native.Judged._fields
+
+
+def _agreement(judged: mixture_native.Judged, extent: float) -> Agreement:
+    return Agreement(*judged[:6], extent, *judged[6:])
 
 
 def _score(agreement: Agreement) -> float:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from epigauge.linear import Dense
 from epigauge.two_view.criteria import Criterion, Distances
-from epigauge.two_view.losses import Loss, Mixture
+from epigauge.two_view.losses import Loss
 from epigauge.two_view.parameterizations import Parameterization
 
 __all__ = ["EliminatedProblem", "EliminatedState"]
@@ -39,7 +39,7 @@ class EliminatedProblem:
         Represents F.
     weights : ndarray, shape (m,)
         Factor of each match's cost.
-    loss : Loss or Mixture
+    loss : Loss
         Applied to the squared distances.
     exact : bool
         Exact Hessian (Newton), and steps bent like F, rather than J^T J (Gauss-Newton).
@@ -50,7 +50,7 @@ class EliminatedProblem:
         criterion: Criterion,
         parameterization: Parameterization,
         weights: Array,
-        loss: Loss | Mixture,
+        loss: Loss,
         exact: bool,
     ) -> None:
         self.criterion = criterion

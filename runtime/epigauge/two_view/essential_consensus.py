@@ -90,12 +90,13 @@ class EssentialConsensus(Consensus):
 
     def _from(self, start: Agreement, pool: NDArray[np.bool_]) -> list[Agreement]:
         """Return agreements climbed to from subsets of a pool, and from the start itself."""
-        essential = self.judge(self.nearest(start.F), start.sigma, start.share, start.extent)
+        known = start.sigma, start.share, start.extent, start.about
+        essential = self.judge(self.nearest(start.F), *known)
         begun = [essential]
         if np.count_nonzero(pool) >= Essential.dimension:
             some = self.cameras.some(pool)
             candidates = essential_starts(some, np.ones(some.q1.shape[1]), _EACH, robust=True)
-            begun += [self.judge(F, start.sigma, start.share, start.extent) for F in candidates]
+            begun += [self.judge(F, *known) for F in candidates]
         begun.sort(key=lambda agreement: -_worth(agreement))
         return [self.climb(agreement) for agreement in begun[:_CLIMBERS]]
 

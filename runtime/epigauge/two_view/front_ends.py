@@ -159,7 +159,7 @@ def _native(
         agreements.append(consensus.judge(found.F, scale))
     if not agreements:
         return None
-    return consensus.search(agreements, rng)
+    return consensus.heavier(consensus.search(agreements, rng), agreements)
 
 
 def _is_sharp(

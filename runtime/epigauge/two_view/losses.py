@@ -12,7 +12,7 @@ import numpy as np
 from epigauge_generated.numpy_backend import losses
 from numpy.typing import NDArray
 
-__all__ = ["EFFICIENT", "LOSSES", "Loss", "Mixture", "median", "robust_scale", "scale_of_median"]
+__all__ = ["EFFICIENT", "LOSSES", "Loss", "median", "robust_scale", "scale_of_median"]
 
 Array = NDArray[np.float64]
 _Values = tuple[Array, Array, Array]
@@ -48,59 +48,6 @@ class Loss:
         value, first, second = np.empty((3, *squared.shape))
         getattr(losses, f"loss_{self.name}")(squared, self.scale**2, value, first, second)
         return value, first, second
-
-
-@dataclass(frozen=True)
-class Mixture:
-    """The loss whose sum is the likelihood of right matches mixed with wrong ones.
-
-    Distances of right matches are normal, those of wrong ones uniform:
-
-        value(d^2) = -2 sigma^2 log((exp(-d^2 / (2 sigma^2)) + odds) / (1 + odds)).
-
-    The first derivative is the probability that a match is right.
-
-    Attributes
-    ----------
-    sigma : float
-        Standard deviation of right distances.
-    peak : float
-        Density of right distances at zero, times their share.
-    odds : float
-        Density of wrong distances, times their share, over `peak`.
-    """
-
-    sigma: float
-    peak: float
-    odds: float
-
-    @staticmethod
-    def of(sigma: float, share: float, extent: float) -> Mixture:
-        """Return the mixture for a share of right matches and a range of distances."""
-        peak = share / (sigma * float(np.sqrt(2.0 * np.pi)))
-        return Mixture(sigma, peak, (1.0 - share) / extent / peak)
-
-    def __call__(self, squared: Array) -> _Values:
-        """Return value and first two derivatives by the squared distance, as `Loss` does."""
-        variance = self.sigma**2
-        logarithm, total = self._logarithms(squared)
-        right = np.exp(logarithm - total)
-        value = 2.0 * variance * (np.log1p(self.odds) - total)
-        return value, right, -0.5 * right * (1.0 - right) / variance
-
-    def logarithm(self, squared: Array) -> Array:
-        """Return the logarithm of the density of all distances."""
-        return np.asarray(self._logarithms(squared)[1] + np.log(self.peak))
-
-    @property
-    def even(self) -> float:
-        """Return the distance at which right and wrong are as likely; 0 where there is none."""
-        return self.sigma * float(np.sqrt(max(-2.0 * np.log(self.odds), 0.0)))
-
-    def _logarithms(self, squared: Array) -> tuple[Array, Array]:
-        """Return the logarithms of exp(-d^2 / (2 sigma^2)) and of that plus odds."""
-        logarithm = -0.5 * squared / self.sigma**2
-        return logarithm, np.log(np.exp(logarithm) + self.odds)
 
 
 def median(values: Array) -> float:

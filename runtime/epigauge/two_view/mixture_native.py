@@ -23,7 +23,7 @@ class MixtureOptions(ctypes.Structure):
 
     _fields_ = (
         *((name, ctypes.c_double) for name in ("extent", "range", "widest", "floor")),
-        *((name, ctypes.c_double) for name in ("least", "most", "climbed", "ftol")),
+        *((name, ctypes.c_double) for name in ("least", "most", "halo", "climbed", "ftol")),
         *((name, ctypes.c_int) for name in ("climbs", "steps")),
     )
 
@@ -37,6 +37,8 @@ class Judged(NamedTuple):
     sigma: float
     share: float
     score: float
+    near: float
+    spread: float
 
 
 @cache
@@ -52,7 +54,7 @@ def judge(
     q1: Array,
     q2: Array,
     F: Array,
-    fitted: tuple[float, float] | None,
+    fitted: tuple[float, float, float, float] | None,
     options: MixtureOptions,
 ) -> Judged:
     """Measure the matches; fit deviation and share from some, where these are given.
@@ -63,13 +65,14 @@ def judge(
         Conditioned matches, contiguous.
     F : ndarray, shape (3, 3)
         Fundamental matrix.
-    fitted : (float, float) or None
-        Deviation of right distances and their share.
+    fitted : (float, float, float, float) or None
+        Deviation of right distances and their share, share of wrong ones near, and their spread.
     options : MixtureOptions
         How.
     """
     m = q1.shape[1]
-    numbers = np.array([*(fitted or (0.0, 0.0)), 0.0])
+    sigma, share, *others = fitted or (0.0,) * 4
+    numbers = np.array([sigma, share, 0.0, *others])
     matrix, signed, oriented = np.ascontiguousarray(F), np.empty(m), np.empty(m, np.bool_)
     done = _functions()[0](
         m,
@@ -94,7 +97,7 @@ def climb(q1: Array, q2: Array, start: Judged, options: MixtureOptions) -> Judge
     options : MixtureOptions
         How.
     """
-    numbers = np.array([start.sigma, start.share, start.score])
+    numbers = np.array([start.sigma, start.share, start.score, start.near, start.spread])
     F, signed, oriented = start.F.copy(), start.signed.copy(), start.oriented.copy()
     done = _functions()[1](
         q1.shape[1],

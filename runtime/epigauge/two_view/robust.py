@@ -195,7 +195,9 @@ def estimate_fundamental(
     many matches agree within the noise of good detectors, the range is a small one around it:
     wrong matches of repeated structure are dense beside the epipolar lines. Elsewhere it is that of
     the coordinates, and the likelihood is climbed from what the search found at several noises and
-    from 8-point estimates of random subsets of the inliers, until that finds nothing higher.
+    from 8-point estimates of random subsets of the inliers, until that finds nothing higher. A part
+    of the wrong matches may then be normal, too, but wide, where that leaves right ones which are
+    at least twice as sharp.
     Matches that violate the oriented epipolar constraint count as wrong.
 
     Windows of a facade that are taken for others of their row agree with an F of their own, whose
