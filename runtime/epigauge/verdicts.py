@@ -65,7 +65,7 @@ FLAGS = {
         "one homography explains the matches within the noise: a planar scene, or a camera that "
         "only turned; the matches do not determine F",
         "match points off the plane too, or use the homography; with K known, essential=True "
-        "leaves at most two motions",
+        'leaves at most two motions (flag "two motions" where it does)',
         ("F", "views"),
     ),
     "nearly planar": Flag(
@@ -78,6 +78,13 @@ FLAGS = {
         "plane cannot be excluded",
         "take images from different places",
         ("F", "E", "views"),
+    ),
+    "two motions": Flag(
+        "the points lie in one plane, and two motions of the calibrated cameras explain them "
+        "alike, with all points in front",
+        "match points off the plane, add a third image, or compare both motions (starts=20, "
+        "result.minima)",
+        ("E",),
     ),
     "pure translation": Flag(
         "the camera moved without turning: every focal length explains the tracks",

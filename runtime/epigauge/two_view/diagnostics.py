@@ -20,6 +20,7 @@ from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.essential import Calibrated
 from epigauge.two_view.evidence import ROUNDING, Evidence
 from epigauge.two_view.homography import fit_homography, plane_squares
+from epigauge.two_view.plane_motions import leaves_two_motions
 from epigauge.two_view.planes import (
     EPIPOLE,
     HIDDEN,
@@ -134,6 +135,8 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     - pure rotation: planar, and H = K R K^-1 within three standard deviations, with square pixels
       and a focal length and principal point that cameras have. Of calibrated cameras, planar, and
       the same bound holds for ``S_R / (2 n - 3)``, the rotation's;
+    - two motions: of calibrated cameras, planar, and both motions of the homography have all points
+      in front of the cameras, but for one in fifty;
     - not oriented; of calibrated cameras behind the cameras: some points farther from being in
       front of both than three standard deviations;
     - wrong calibration: of calibrated cameras, a free F leaves a sum of squares that is less by
@@ -244,22 +247,29 @@ def plane_flags(found: Evidence, *, tested: bool = False) -> dict[str, bool]:
     explained = explained or (nearly and model.flat)
     q1, q2 = found.q1[:, on], found.q2[:, on]
     n, more = len(weights), displacement(found, q1, q2, weights) - model.cost
+    two = False
     if found.from_rays is None:
         maps, redundancy = (found.to_units1, found.to_units2), n - found.parameters
         turned = explained and may_be_rotation(
             *maps, model.H, model.normal, noise2**0.5, redundancy
         )
     else:
-        squared = Calibrated(q1, q2, *found.from_rays).from_rotation(weights)
+        A1, A2 = found.from_rays
+        cameras = Calibrated(q1, q2, A1, A2)
+        squared = cameras.from_rotation(weights)
         with np.errstate(invalid="ignore"):  # a match that no rotation maps: none is claimed
             S_R = float(weights @ squared)
         turned = (2 * n - 3) * bound >= (2 * n - 8) * S_R
+        if explained:
+            H = np.asarray(np.linalg.solve(A2, model.H @ A1))
+            two = leaves_two_motions(H, cameras.rays(q1, q2)[0])
     still = explained and more <= still_bound(n) * max(model.cost / max(2 * n - 8, 1), ROUNDING**2)
     return {
         "still camera": still,
         "planar scene": explained and not still,
         "nearly planar": nearly and not explained,
         "pure rotation": explained and not still and turned,
+        "two motions": two and not still and not turned,
         "near-affine": not still and _is_affine(found, on),
     }
 

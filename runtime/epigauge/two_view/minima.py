@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge.two_view.covariance import residual_noise, tangent_basis
 from epigauge.two_view.criteria import Reprojection
-from epigauge.two_view.essential import Motion
-from epigauge.two_view.evidence import Evidence, evidence
+from epigauge.two_view.diagnostics import planar_bound
+from epigauge.two_view.essential import Essential, Motion
+from epigauge.two_view.evidence import ROUNDING, Evidence, evidence
 from epigauge.two_view.five_point import log_cost
+from epigauge.two_view.homography import fit_homography
 from epigauge.two_view.losses import Loss
 from epigauge.two_view.solve import Matches, Options, Solution, joined, minimize
 
@@ -36,6 +38,9 @@ AMBIGUOUS = 9.0
 _SPREAD = 10.0
 _WIDEST = 2.0
 _SEED = 20040301
+
+#: What a match off a plane counts at most, in units of the noise squared: a few are wrong.
+_FAR = 18.0
 
 #: Two results are one minimum when their costs (relative) and their F (unit norm) differ by less.
 _SAME_COST = 1e-6
@@ -195,7 +200,12 @@ def chosen(matches: Matches, options: Options, found: list[Solution]) -> Search:
         m = int(np.count_nonzero(matches.weights > 0.0))
         doubts = np.array([motion.doubt for motion in motions if motion is not None])
         costs = np.array([2.0 * _cost(group[0]) for group in groups])
-        first = int(np.argmin(log_cost(costs, m) + doubts))
+        noise = min(case.noise for case in cases)
+        if len(groups) > 1 and _on_a_plane(matches, m, noise):
+            # Both motions of a plane are exact: what their costs differ by is noise
+            first = int(np.lexsort((costs, np.round(doubts)))[0])
+        else:
+            first = int(np.argmin(log_cost(costs, m) + doubts))
     best = groups[first][0]
     noise_px = cases[first].noise_of_weight_one * matches.frame.scale
     bound = minima[first].cost + 0.5 * AMBIGUOUS * noise_px**2
@@ -212,6 +222,14 @@ def chosen(matches: Matches, options: Options, found: list[Solution]) -> Search:
     )
     solution = replace(best, outcome=outcome)
     return Search(solution, cases[first], minima, rivals > 1, motions[first])
+
+
+def _on_a_plane(matches: Matches, m: int, noise: float) -> bool:
+    """Tell whether a homography explains calibrated matches within a noise."""
+    squares = fit_homography(matches.q1, matches.q2, matches.weights, matches.table)[1]
+    noise2 = max(noise, ROUNDING) ** 2
+    cost = float(np.sum(np.minimum(matches.weights * squares, _FAR * noise2)))
+    return cost <= planar_bound(m, Essential.dimension) * noise2
 
 
 def _motion(matches: Matches, options: Options, solution: Solution) -> Motion | None:
