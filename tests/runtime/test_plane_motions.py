@@ -84,7 +84,7 @@ def test_a_camera_that_only_turned_or_moved_along_the_normal_leaves_one():
 @pytest.mark.parametrize("wrong", [0, 30])
 def test_a_motion_from_a_plane_is_right_or_told_to_be_one_of_two(wrong):
     outcomes = set()
-    for seed in range(100, 112):
+    for seed in range(100, 106):
         x1, x2, _, t, _ = plane(seed, wrong=wrong)
         results = [eg.estimate_essential(x1, x2, K)]
         if not wrong:
