@@ -65,7 +65,7 @@ FLAGS = {
         "one homography explains the matches within the noise: a planar scene, or a camera that "
         "only turned; the matches do not determine F",
         "match points off the plane too, or use the homography; with K known, essential=True "
-        'leaves at most two motions (flag "two motions" where it does)',
+        "leaves at most two motions",
         ("F", "views"),
     ),
     "nearly planar": Flag(
