@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 from epigauge.two_view.consensus import RANGE, Agreement, Consensus
-from epigauge.two_view.essential import Calibrated, Essential, in_front, motions
+from epigauge.two_view.essential import Calibrated, Essential
 from epigauge.two_view.five_point import essential_starts
 from epigauge.two_view.homography import robust_homography
 from epigauge.two_view.parameterizations import Remapped
@@ -33,9 +33,10 @@ _BLUNTER = 2.0
 #: An improvement of the likelihood that is worth another round.
 _CLIMBED = 1e-3
 
-#: Where a larger share of the matches that agree is behind the cameras, they may be on a plane
-#: whose other motion sees them; it agrees with this part of the matches at least.
-_BEHIND, _AS_MANY = 0.02, 0.9
+#: Where a larger share of the matches that agree is behind the cameras, each by three standard
+#: deviations, they may be on a plane whose other motion sees them; it agrees with this part of the
+#: matches at least.
+_BEHIND, _DOUBT, _AS_MANY = 0.02, 4.5, 0.9
 
 #: Standard deviation of the noise, conditioned, that few matches are judged with.
 _BLIND = 0.01
@@ -88,28 +89,27 @@ class EssentialConsensus(Consensus):
         Both motions of a plane agree alike but for noise and for wrong matches.
         """
         pool = best.inliers(3.0 * best.sigma)
-        near, ahead = self._counts(best)
-        if near < Essential.dimension or ahead >= (1.0 - _BEHIND) * near:
+        near, doubt = np.count_nonzero(pool), self._doubt(best)
+        if near < Essential.dimension or doubt <= _DOUBT * max(_BEHIND * near, 1.0):
             return best
         own = self.cameras.some(pool)
-        weights = np.ones(near)
-        H, _ = robust_homography(own.q1, own.q2, weights, self.criterion.kernels)
+        H, _ = robust_homography(own.q1, own.q2, np.ones(near), self.criterion.kernels)
         for E in essentials(np.asarray(np.linalg.solve(own.A2, H @ own.A1))):
             known = best.sigma, best.share, best.extent, best.about
             other = self.climb(self.judge(self.cameras.fundamental(E), *known))
-            count, front = self._counts(other)
-            if count >= _AS_MANY * near and front > ahead:
-                best, ahead = other, front
+            as_many = np.count_nonzero(other.inliers(3.0 * other.sigma)) >= _AS_MANY * near
+            if as_many and (less := self._doubt(other)) < doubt:
+                best, doubt = other, less
         return best
 
-    def _counts(self, found: Agreement) -> tuple[int, int]:
-        """Return how many matches agree, and how many of these may be of points in front."""
+    def _doubt(self, found: Agreement) -> float:
+        """Return what speaks against the matches that agree being of points in front."""
         rows = found.inliers(3.0 * found.sigma)
-        own = self.cameras.some(rows)
-        rays = own.rays(own.q1, own.q2)
-        motion = motions(own.A2.T @ found.F @ own.A1)
-        ahead = np.count_nonzero(in_front(*motion, *rays), axis=1)
-        return int(np.count_nonzero(rows)), int(np.max(ahead))
+        own, squared = self.cameras.some(rows), found.signed[rows] ** 2
+        hats = own.q1, own.q2  # distances from the ends differ little from those of corrected ones
+        return float(
+            own.motion(found.F, hats, squared, np.ones(len(squared)), found.sigma**2).doubt
+        )
 
     def _searched(self, starts: list[Agreement]) -> Agreement:
         ranked = sorted(starts, key=lambda start: -start.score)[:_POOLS]
