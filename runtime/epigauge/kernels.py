@@ -26,7 +26,7 @@ from epigauge_generated.signatures import SIGNATURES, Argument, Signature
 from numpy.typing import NDArray
 
 from epigauge._arguments import as_choice
-from epigauge._library import NOT_COMPILED, failed, library
+from epigauge._library import NOT_COMPILED, address, failed, library
 from epigauge._options import Backend
 from epigauge.errors import BackendError
 
@@ -206,8 +206,8 @@ def _prepare(signature: Signature, inputs: tuple[Any, ...]) -> tuple[list[Array]
         own = array.shape[len(argument.shape) :]
         if array.shape[: len(argument.shape)] != argument.shape or (own and not argument.batched):
             raise TypeError(f"{argument.name} has shape {array.shape}, needed: {argument.shape}")
-        if own != batch:
-            batch = np.broadcast_shapes(batch, own)
+        if own and own != batch:
+            batch = np.broadcast_shapes(batch, own) if batch else own
     if len(batch) != 1 and not all(argument.batched for argument in signature.outputs):
         raise TypeError("a kernel that sums over observations needs exactly one batch axis")
     return arrays, batch
@@ -247,8 +247,7 @@ def _wrap_c(name: str, signature: Signature) -> Kernel:
             for argument, array in zip(signature.inputs, arrays, strict=True)
         ]
         outputs = _outputs(signature, batch)
-        pointers = [array.__array_interface__["data"][0] for array in (*arrays, *outputs)]
-        function(math.prod(batch), *pointers)
+        function(math.prod(batch), *map(address, (*arrays, *outputs)))
         return _result(outputs)
 
     return call

@@ -94,10 +94,6 @@ def _turned(evidence: Evidence, found: MetricReconstruction, noise_px: float) ->
     return asked > 0
 
 
-def _units(rays: Array) -> Array:
-    return np.asarray(rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300))
-
-
 def _pixels_a_radian(found: MetricReconstruction) -> float:
     """Return how far images move with a ray, about."""
     model, params = camera_model(found.cameras.model), found.cameras.params
