@@ -193,6 +193,12 @@ FLAGS = {
         "begin elsewhere, or look for wrong matches",
         ("views",),
     ),
+    "strayed views": Flag(
+        "most observations of a view were set aside as gross errors: its camera is wrong, or its "
+        "matches are",
+        "leave the views out that the message names, match them anew, or begin elsewhere",
+        ("views",),
+    ),
     "outliers": Flag(
         "more residuals are beyond four standard deviations than noise explains: gross errors are "
         "left, which pull at the result",

@@ -11,7 +11,7 @@ from epigauge.metric.growth import grown
 from epigauge.metric.samples import sampled
 from epigauge.metric.scene import Images
 from epigauge.metric.search import Search
-from epigauge.metric.three_points import agreed_pose
+from epigauge.multi_view.three_points import agreed_pose
 
 OPTIONS = {"workers": 1, "backend": None}
 

@@ -26,8 +26,12 @@ Kernel = Callable[..., Any]
 _FOCAL = ("f", "fx", "fy", "c")
 _SIDES = ("width", "height")
 
-#: A measured point whose correction is farther than this from the image, of its size, is another's.
+#: A measured point whose correction is farther than this from the image, of its size, is another's;
+#: and so is one whose direction has its image so far away.
 _MISSED = 1e-6
+
+#: Newton steps to a direction.
+_STEPS = 30
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,41 @@ class CameraModel:
                 upright &= slope[0, 0] + slope[1, 1] > 0.0
                 pixels[:, ~(upright & (missed.max(axis=0) <= _MISSED * size))] = np.inf
         return pixels, depths
+
+    def directions(self, pixels: Array, params: Array) -> tuple[Array, Array]:
+        """Return where cameras see pixels on the plane one away along their z axis.
+
+        Parameters
+        ----------
+        pixels, params : ndarray, shape (2, N), (k, N)
+            One column an observation.
+
+        Returns
+        -------
+        h : ndarray, shape (2, N)
+            The point (h, 1) has the image; NaN where none has.
+        derivative : ndarray, shape (N, 2, 2)
+            Of h by the pixel.
+        """
+        image = self.kernel("image")
+        h = np.zeros((3, pixels.shape[1]))
+        h[2] = 1.0
+        with np.errstate(all="ignore"):
+            for _ in range(_STEPS):
+                found, slope = image(h, params)
+                inverse = _inverses(slope[:, :2].transpose(2, 0, 1))
+                h[:2] -= np.einsum("nij,jn->in", inverse, found - pixels)
+            found, slope = image(h, params)
+            off = np.abs(found - pixels).max(axis=0)
+            h[:2, ~(off <= _MISSED * np.maximum(1.0, np.abs(pixels).max(axis=0)))] = np.nan
+            return h[:2], _inverses(slope[:, :2].transpose(2, 0, 1))
+
+
+def _inverses(a: Array) -> Array:
+    """Return inverses of 2x2 matrices, not finite where there are none."""
+    determinant = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
+    adjoint = np.array([[a[:, 1, 1], -a[:, 0, 1]], [-a[:, 1, 0], a[:, 0, 0]]]).transpose(2, 0, 1)
+    return np.asarray(adjoint / determinant[:, None, None])
 
 
 _MODELS = {

@@ -16,9 +16,9 @@ from epigauge.bundle.prior_kinds import IntrinsicPrior
 from epigauge.cameras import Cameras, MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError, EpigaugeError
 from epigauge.metric.scene import Images, cameras_of, with_all_points
-from epigauge.metric.three_points import agreed_pose
 from epigauge.multi_view.adjust import bundle_adjust
 from epigauge.multi_view.first_pair import common_points, rows_of
+from epigauge.multi_view.three_points import agreed_pose
 from epigauge.multi_view.tracks import MIN_VIEWS, Tracks
 from epigauge.two_view.calibrated import estimate_essential
 

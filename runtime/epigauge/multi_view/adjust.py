@@ -135,7 +135,9 @@ def bundle_adjust(
         For measured tracks with gross errors: begin from what most observations agree on
         (``initialize(tracks, robust=True)``), adjust with a Cauchy loss, set aside what is beyond
         six standard deviations of the noise, and adjust the rest with the `loss` asked for, until
-        the same is set aside again. What was is told in `rejected`; it has no part in cost, RMS,
+        the same is set aside again. A view that would lose most of its observations is first found
+        anew from the points that others hold; the flag "strayed views" says that it lost them all
+        the same. What was set aside is told in `rejected`; it has no part in cost, RMS,
         flags and rank. Counts and history are those of the last adjustment.
     loss : {"linear", "huber", "soft_l1", "cauchy", "truncated"}
         Loss of each squared residual. A robust one weighs gross errors down from a start that is
@@ -232,7 +234,9 @@ def bundle_adjust(
         table = kernels.table(backend)
         start = initialize(tracks, robust=True, backend=backend) if start is None else start
         last = as_choice("loss", loss, LOSSES), loss_scale_px
-        return without_gross_errors(partial(bundle_adjust, **options), tracks, start, table, last)
+        held = fixed_indices("fixed_views", fixed_views, tracks.n_views)
+        once = partial(bundle_adjust, **options)
+        return without_gross_errors(once, tracks, start, table, last, held)
     as_choice("method", method, STRATEGIES)
     as_choice("gauge_mode", gauge_mode, ("explicit", "implicit"))
     as_choice("schedule", schedule, ("auto", *SCHEDULES))

@@ -18,9 +18,6 @@ __all__ = ["checked_lines", "frame_of", "line_pieces", "projective_segments", "s
 
 Array = NDArray[np.float64]
 
-#: Newton steps to a direction without distortion, and pixels that it may be off.
-_STEPS, _MISSED = 30, 1e-6
-
 #: A line of sight along the line meets it nowhere in particular.
 _PARALLEL = 1e-6
 
@@ -83,7 +80,7 @@ def segments_of(
     params = reconstruction.cameras.of_views[lines.view].T
     moved, covariances = ends.copy(), spread.copy()
     for k in (0, 1):
-        straight, D = _undistorted(model.kernel("image"), ends[2 * k : 2 * k + 2], params)
+        straight, D = model.directions(ends[2 * k : 2 * k + 2], params)
         own, missed = K[lines.view], ~np.isfinite(straight).all(axis=0)
         if missed.any():
             was = f"have an end point in row {lines.order[int(np.argmax(missed))]} that the camera"
@@ -102,29 +99,6 @@ def segments_of(
 
 def _whole(array: Array) -> Array:
     return np.ascontiguousarray(array)
-
-
-def _undistorted(image: Any, q: Array, params: Array) -> tuple[Array, Array]:
-    """Return h0/h2, h1/h2 of pixels (2, N), NaN where there is none, and their derivatives."""
-    h = np.zeros((3, q.shape[1]))
-    h[2] = 1.0
-    with np.errstate(all="ignore"):
-        for _ in range(_STEPS):
-            found, slope = image(h, params)
-            a = slope[:, :2].transpose(2, 0, 1)
-            inverse = _inverses(a)
-            h[:2] -= np.einsum("nij,jn->in", inverse, found - q)
-        found, slope = image(h, params)
-        off = np.abs(found - q).max(axis=0)
-        h[:2, ~(off <= _MISSED * np.maximum(1.0, np.abs(q).max(axis=0)))] = np.nan
-        return h[:2], _inverses(slope[:, :2].transpose(2, 0, 1))
-
-
-def _inverses(a: Array) -> Array:
-    """Return inverses of 2x2 matrices, not finite where there are none."""
-    determinant = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
-    adjoint = np.array([[a[:, 1, 1], -a[:, 0, 1]], [-a[:, 1, 0], a[:, 0, 0]]]).transpose(2, 0, 1)
-    return np.asarray(adjoint / determinant[:, None, None])
 
 
 def line_pieces(lines: LineTracks, reconstruction: MetricReconstruction) -> Array:

@@ -2,7 +2,8 @@
 
 A robust loss finds the geometry that most observations agree on; what is far from it is set aside,
 and the rest is adjusted as if it had been clean. What is set aside is asked again after each
-adjustment, until the verdict stays the same.
+adjustment, until the verdict stays the same. A view that much is set aside of may have
+a camera that strayed: it is found anew from the points that the others hold, or told by a flag.
 """
 
 from __future__ import annotations
@@ -19,8 +20,12 @@ from epigauge.multi_view.agreement import agreed_points
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import normalized
 from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.result import told
+from epigauge.multi_view.strayed import found_anew, strayed
 from epigauge.multi_view.tracks import MIN_VIEWS, Tracks
+from epigauge.multi_view.verdicts.verdict import Verdict
 from epigauge.two_view.losses import EFFICIENT, median
+from epigauge.verdicts import ordered
 
 if TYPE_CHECKING:
     from epigauge.multi_view.adjust import BundleResult
@@ -29,6 +34,7 @@ __all__ = ["Adjust", "GrossErrors", "without_gross_errors"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Indices = NDArray[np.intp]
 
 #: Median distance of two normal coordinates of standard deviation one.
 _MEDIAN = 1.1774
@@ -40,6 +46,9 @@ _GROSS = 6.0
 #: Robust adjustments at most, the decrease of the median distance that asks for another, and
 #: rounds of setting aside.
 _ROBUST_ROUNDS, _LOWER, _ROUNDS = 8, 0.99, 12
+
+#: Rounds of finding views anew at most, and how many that strayed are named.
+_ANEW, _LISTED = 3, 5
 
 #: The set aside is settled when less than this share of the observations changes sides.
 _SETTLED = 1e-3
@@ -60,7 +69,12 @@ class Adjust(Protocol):
 
 
 def without_gross_errors(
-    adjust: Adjust, tracks: Tracks, start: Any, kernels: Table, loss: tuple[str, float | str]
+    adjust: Adjust,
+    tracks: Tracks,
+    start: Any,
+    kernels: Table,
+    loss: tuple[str, float | str],
+    fixed_views: Indices,
 ) -> BundleResult:
     """Adjust tracks some of which are wrong.
 
@@ -76,6 +90,8 @@ def without_gross_errors(
         Backend.
     loss : tuple
         Name and scale of the loss of the last adjustments, of the observations that are kept.
+    fixed_views : ndarray of int
+        Views that stay where they are.
 
     Returns
     -------
@@ -83,15 +99,14 @@ def without_gross_errors(
         The last adjustment, with what was set aside in `rejected`.
     """
     search = GrossErrors(tracks, kernels)
-    typical = np.inf
-    for _ in range(_ROBUST_ROUNDS):
-        found = adjust(tracks, start, loss="cauchy", loss_scale_px="auto")
+    found = _agreed(adjust, search, start)
+    for _ in range(_ANEW):
         if found.status == -2:
             return found
-        start = search.agreed(found.reconstruction)
-        before, typical = typical, search.typical(start)
-        if not typical < _LOWER * before:
+        begun = search.found_anew(found.reconstruction, fixed_views)
+        if begun is None:
             break
+        found = _agreed(adjust, search, begun)
     start, rejected = found.reconstruction, search.gross(found.reconstruction)
     for _ in range(_ROUNDS):
         kept = search.without(rejected)
@@ -104,14 +119,35 @@ def without_gross_errors(
     moved = start is not found.reconstruction
     fun = tracks.xy - start.project(tracks) if moved else found.fun
     # The last one alone: a copy is judged, which those before need not be.
-    message = _told(found.message, aside)
+    left = strayed(tracks, aside)
+    if len(left):
+        flags = ordered((*found.flags, "strayed views"))
+        verdict = Verdict(flags, found.rank, found.n_behind, found.condition, found.weakest)
+        found = replace(found, **told(verdict, found.status))
+    message = _told(found.message, aside, left)
     return replace(found, reconstruction=start, fun=fun, rejected=aside, message=message)
 
 
-def _told(message: str, rejected: Mask) -> str:
-    """Return a message that tells of what was set aside."""
+def _agreed(adjust: Adjust, search: GrossErrors, start: Any) -> BundleResult:
+    """Adjust with a robust loss until the median distance stays the same."""
+    typical = np.inf
+    for _ in range(_ROBUST_ROUNDS):
+        found = adjust(search.tracks, start, loss="cauchy", loss_scale_px="auto")
+        if found.status == -2:
+            break
+        start = search.agreed(found.reconstruction)
+        before, typical = typical, search.typical(start)
+        if not typical < _LOWER * before:
+            break
+    return found
+
+
+def _told(message: str, rejected: Mask, left: Indices) -> str:
+    """Return a message that tells of what was set aside, and of most of which views."""
     count = int(np.count_nonzero(rejected))
     share = f"{count} of {len(rejected)} observations set aside as gross errors"
+    views = ", ".join(map(str, left[:_LISTED])) + ", ..." * (len(left) > _LISTED)
+    share += f", most of those of view{'s' * (len(left) > 1)} {views}" if len(left) else ""
     return f"{message}; {share if count else 'nothing set aside'}"
 
 
@@ -171,11 +207,24 @@ class GrossErrors:
             Those beyond six standard deviations of the noise.
         """
         distances = self.distances(found, fun)
-        limit = _GROSS * max(median(distances[self.counts]) / _MEDIAN, 1e-12 * self.frame.scale)
-        gross = self.counts & ((distances > limit) | self._at_centre(found))
+        gross = self.counts & ((distances > self._limit(distances)) | self._at_centre(found))
         kept = self.counts & ~gross
         lengths = np.bincount(self.tracks.point[kept], minlength=self.tracks.n_points)
         return np.asarray(gross | (self.counts & (lengths < MIN_VIEWS)[self.tracks.point]))
+
+    def _limit(self, distances: Array) -> float:
+        """Return the distance beyond which an observation is a gross error."""
+        noise = median(distances[self.counts]) / _MEDIAN
+        return _GROSS * max(noise, 1e-12 * self.frame.scale)
+
+    def found_anew(self, found: Any, fixed_views: Indices) -> Any | None:
+        """Return the reconstruction with doubtful cameras where the points of others want them.
+
+        None where no camera is, or none is better elsewhere.
+        """
+        rejected = self.gross(found)
+        limit = self._limit(self.distances(found))
+        return found_anew(self.parts[0], self.tracks, found, rejected, fixed_views, limit)
 
     def _at_centre(self, found: Any) -> Mask:
         """Return which observations are of points that have moved into the camera's centre.
