@@ -1,33 +1,19 @@
-"""Conversion and checks of arguments: done once, at the border of the library.
-
-Each function returns the value in the one form that the rest of the library works with, or raises
-`ArgumentError`, which names the argument, what it was and what is needed. No input is ever changed.
-"""
+"""Checks of matches: their points, weights, scores and covariances."""
 
 from __future__ import annotations
 
-import difflib
-import operator
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from epigauge._arguments.convert import MAX_PX, MIN_PX, as_double, as_real, on_host
 from epigauge.errors import ArgumentError
 
 __all__ = [
-    "MAX_PX",
     "MAX_WEIGHT",
-    "MIN_PX",
-    "as_calibration",
-    "as_choice",
-    "as_count",
     "as_covariances",
-    "as_fundamental",
     "as_matches",
-    "as_positive",
-    "as_real",
     "as_score",
     "as_weights",
     "check_general_position",
@@ -37,15 +23,8 @@ Array = NDArray[np.float64]
 
 _POINTS = "an (m, 2) array of pixel coordinates"
 
-#: Pixel coordinates are accepted up to MAX_PX, and sets of them whose largest is zero or at least
-#: MIN_PX: fourth powers of others overflow or vanish.
-MIN_PX, MAX_PX = 1e-70, 1e70
-
 #: Largest weight accepted.
 MAX_WEIGHT = 1e100
-
-#: Binary exponent from which a matrix of free scale is rescaled, which is exact.
-_EXPONENT = 200
 
 #: A point set is collinear when its thickness is below this fraction of its length. Image points
 #: are never measured to 1e-7 of an image, and text files round there.
@@ -141,177 +120,6 @@ def check_general_position(name: str, points: Array, *, eps: float = 2.0**-52) -
             f"has all its points{image} {'equal' if equal else 'on one line'}",
             "points spread over two dimensions in both images, else F is not determined",
         )
-
-
-def as_choice(name: str, value: object, choices: Iterable[str]) -> str:
-    """Check that an option is one of the strings allowed.
-
-    Parameters
-    ----------
-    name : str
-        Name of the argument for the message.
-    value : object
-        What the caller gave.
-    choices : iterable of str
-        What is allowed.
-
-    Returns
-    -------
-    str
-        The value.
-
-    Raises
-    ------
-    ArgumentError
-        If the value is not among the choices; the message suggests a similar one.
-    """
-    allowed = list(choices)
-    if isinstance(value, str) and value in allowed:
-        return value
-    listed = ", ".join(repr(choice) for choice in allowed)
-    needed = listed if len(allowed) == 1 else f"one of {listed}"
-    if isinstance(value, str):
-        close = difflib.get_close_matches(value.lower(), allowed, n=1)
-        if close:
-            needed += f" (did you mean {close[0]!r}?)"
-    raise ArgumentError(name, f"is {_shown(value)}", needed)
-
-
-def as_fundamental(F0: ArrayLike, name: str = "F0") -> Array:
-    """Check a fundamental matrix: real, finite, not zero.
-
-    Parameters
-    ----------
-    F0 : array_like, shape (3, 3)
-        The matrix. Its rank and scale are the business of the caller.
-    name : str
-        Name of the argument for the message.
-
-    Returns
-    -------
-    ndarray, shape (3, 3), float64
-        A matrix that may share memory with the input: do not write into it. One whose largest
-        entry is not between 2^-200 and 2^200 is rescaled, so that products do not overflow.
-
-    Raises
-    ------
-    ArgumentError
-        On another shape or type, NaN, infinity, or a matrix of zeros.
-    """
-    F = as_real(name, F0, "a (3, 3) matrix")
-    if F.shape != (3, 3):
-        raise ArgumentError(name, f"has shape {F.shape}", "a (3, 3) matrix")
-    if not np.isfinite(F).all():
-        row, column = np.argwhere(~np.isfinite(F))[0]
-        raise ArgumentError(name, f"has {F[row, column]} at [{row}, {column}]", "finite entries")
-    if not F.any():
-        raise ArgumentError(name, "is the zero matrix", "a matrix of rank 2")
-    return rescaled(F)
-
-
-def as_calibration(name: str, K: ArrayLike) -> Array:
-    """Check a calibration matrix: real, finite, upper triangular with a positive diagonal.
-
-    Parameters
-    ----------
-    name : str
-        Name of the argument for the message.
-    K : array_like, shape (3, 3)
-        Maps coordinates on the retina to pixels.
-
-    Returns
-    -------
-    ndarray, shape (3, 3), float64
-        The matrix, scaled to ``K[2, 2] = 1``.
-
-    Raises
-    ------
-    ArgumentError
-        If it is not such a matrix.
-    """
-    matrix = as_fundamental(K, name)
-    if np.any(np.tril(matrix, -1)) or not np.all(np.diag(matrix) / matrix[2, 2] > 0.0):
-        raise ArgumentError(
-            name, "is no calibration matrix", "[[fx, s, cx], [0, fy, cy], [0, 0, 1]]"
-        )
-    scaled = np.asarray(matrix / matrix[2, 2])
-    if not np.abs(scaled).max() <= MAX_PX:
-        raise ArgumentError(
-            name, f"has an entry of {np.abs(scaled).max():g}", f"pixels, up to {MAX_PX:g}"
-        )
-    if not np.diag(scaled).min() >= MIN_PX:
-        was = f"has a focal length of {np.diag(scaled).min():g}"
-        raise ArgumentError(name, was, f"pixels, at least {MIN_PX:g}")
-    return scaled
-
-
-def as_positive(name: str, value: object, *, zero: bool = False) -> float:
-    """Check a positive finite number.
-
-    Parameters
-    ----------
-    name : str
-        Name of the argument for the message.
-    value : object
-        What the caller gave; any real scalar type but bool.
-    zero : bool
-        Accept zero as well.
-
-    Returns
-    -------
-    float
-        The number.
-
-    Raises
-    ------
-    ArgumentError
-        If it is not a number, not finite, or not positive.
-    """
-    needed = "a finite number >= 0" if zero else "a finite number > 0"
-    try:
-        scalar = np.asarray(value)
-        if scalar.ndim != 0 or scalar.dtype.kind not in "iuf":
-            raise TypeError
-        number = float(scalar)
-    except (TypeError, ValueError, OverflowError):
-        raise ArgumentError(name, f"is {_shown(value)}", needed) from None
-    if not np.isfinite(number) or number < 0.0 or (number == 0.0 and not zero):
-        raise ArgumentError(name, f"is {number!r}", needed)
-    return number
-
-
-def as_count(name: str, value: object, *, at_least: int = 1) -> int:
-    """Check a whole number with a lower bound.
-
-    Parameters
-    ----------
-    name : str
-        Name of the argument for the message.
-    value : object
-        What the caller gave; any integer type but bool.
-    at_least : int
-        Smallest number accepted.
-
-    Returns
-    -------
-    int
-        The number.
-
-    Raises
-    ------
-    ArgumentError
-        If it is not an integer, or too small.
-    """
-    needed = f"an integer >= {at_least}"
-    if isinstance(value, bool | np.bool_):
-        raise ArgumentError(name, f"is {_shown(value)}", needed)
-    try:
-        number = operator.index(value)  # type: ignore[arg-type]
-    except TypeError:
-        raise ArgumentError(name, f"is {_shown(value)}", needed) from None
-    if number < at_least:
-        raise ArgumentError(name, f"is {number}", needed)
-    return number
 
 
 def as_weights(weights: ArrayLike, m: int) -> Array:
@@ -455,64 +263,6 @@ def _is_spread(points: Array, eps: float) -> bool:
     )
 
 
-def on_host(name: str, value: Any) -> Any:
-    """Return a tensor of PyTorch or CuPy, or a nullable table of pandas, as an array.
-
-    Everything else, JAX, TensorFlow, xarray, polars among it, NumPy converts itself. None of them
-    is imported.
-    """
-    if isinstance(value, np.ndarray | list | tuple | int | float):
-        return value
-    try:
-        if hasattr(value, "detach") and hasattr(value, "cpu"):
-            return value.detach().cpu().numpy()
-        if hasattr(value, "__cuda_array_interface__") and hasattr(value, "get"):
-            return value.get()
-        if hasattr(value, "to_numpy") and np.asarray(value).dtype.hasobject:
-            return value.to_numpy(dtype=np.float64, na_value=np.nan)
-    except (TypeError, ValueError, RuntimeError) as error:
-        was = f"is a {type(value).__name__} that is no array"
-        raise ArgumentError(name, was, f"numbers of a usual type ({error})") from None
-    return value
-
-
-def as_array(name: str, value: ArrayLike, needed: str) -> NDArray[Any]:
-    """Convert to an array of whatever type, refusing ragged lists and masked entries."""
-    value = on_host(name, value)
-    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
-        raise ArgumentError(name, "is a masked array", f"{needed} without masked entries")
-    try:
-        return np.asarray(value)
-    except (ValueError, TypeError) as error:
-        raise ArgumentError(name, "is not a regular array", f"{needed} ({error})") from None
-
-
-def as_real(name: str, value: ArrayLike, needed: str) -> Array:
-    """Convert to float64, refusing every type that is not a real number."""
-    array = as_array(name, value, needed)
-    if array.dtype.kind not in "iuf":
-        raise ArgumentError(name, f"has type {array.dtype}", f"{needed} of real numbers")
-    return as_double(array)
-
-
-def as_double(array: NDArray[Any]) -> Array:
-    """Convert to float64, at addresses where C may read it.
-
-    A long double beyond its range becomes infinite and a signalling NaN a quiet one, to be
-    refused later.
-    """
-    if array.dtype == np.float64 and array.dtype.isnative and array.flags.aligned:
-        return array
-    with np.errstate(over="ignore", invalid="ignore"):
-        return array.astype(np.float64, copy=not array.flags.aligned)
-
-
-def rescaled(array: Array) -> Array:
-    """Return an array of free scale, times a power of two if its products could overflow."""
-    exponent = int(np.frexp(np.abs(array).max())[1])
-    return array if abs(exponent) < _EXPONENT else np.ldexp(array, -exponent)
-
-
 def _resolution(value: Any) -> float:
     """Relative rounding of the caller's numbers: that of their floating type."""
     dtype = getattr(value, "dtype", None)
@@ -530,12 +280,6 @@ def _hint(shape: tuple[int, ...]) -> str:
     if len(shape) == 2 and shape[1] == 4:
         return " (pass columns 0, 1 as x1 and columns 2, 3 as x2)"
     return ""
-
-
-def _shown(value: object) -> str:
-    """Print a caller's value, cut to a readable length."""
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _number(count: int, noun: str) -> str:
