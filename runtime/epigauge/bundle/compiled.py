@@ -75,7 +75,7 @@ def minimized(
     bundle.point = address(lanes)
     focal = np.array([12 + k for k in problem.model.focal], np.int32)
     stop = ctypes.c_int(0)
-    passes, pairs = own.edges
+    passes, pairs = own.passes.edges
     options = BundleOptions(
         own.refinement(problem.refinement),
         stopping.ftol,
@@ -89,7 +89,7 @@ def minimized(
         len(focal),
         MIN_FOCAL,
         MAX_FOCAL,
-        own.share,
+        own.passes.share,
         len(passes) - 1,
         len(pairs) - 1,
         address(passes),

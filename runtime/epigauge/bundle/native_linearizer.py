@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import copy
 import ctypes
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -25,19 +24,16 @@ from epigauge._native import (
     MOST_TANGENT,
     TRACE,
     Blocks,
-    Part,
     Refinement,
-    Share,
-    aligned_zeros,
-    checked,
     function,
 )
-from epigauge.bundle.lanes import FULL, LaneLayout, Range
+from epigauge.bundle.lanes import FULL, LaneLayout
 from epigauge.bundle.linearizer import Normal, PointRefinement
 from epigauge.bundle.native_coupling import NativeCoupling, NativePairs
 from epigauge.bundle.native_inverse import NativeBlocks
 from epigauge.bundle.numpy_linearizer import DENSE_CAMERAS
 from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.passes import Passes
 from epigauge.bundle.skyline import Skyline
 from epigauge.cameras import CameraModel
 from epigauge.errors import ArgumentError
@@ -119,39 +115,18 @@ class NativeLinearizer:
         widths = map(ctypes.addressof, (camera_sums, self.pair_sums))
         function("bundle_widths")(self.reference, *widths)
         self.camera_sums = camera_sums.value
-        self._passes, self._pairs = self.layout.shares(workers)
-        # The calling thread has the first share.
-        others = max(len(self._passes), len(self._pairs)) - 1
-        self._pool = ThreadPoolExecutor(others) if others else None
+        self.passes = Passes(self.layout, workers)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what it was made from: addresses and threads mean nothing elsewhere."""
-        workers = max(len(self._passes), len(self._pairs))
         own = self.model, self.graph, self.q, self.weights, self.loss
-        parts = workers, self._used, self.factored, self._heaviest, self._beside
+        parts = self.passes.workers, self._used, self.factored, self._heaviest, self._beside
         return NativeLinearizer, (*own, *parts)
 
     def __copy__(self) -> NativeLinearizer:
         other = object.__new__(type(self))
         other.__dict__.update(self.__dict__)
         return other
-
-    @property
-    def edges(self) -> tuple[Indices, Indices]:
-        """Return where the threads' ranges of chunks end, for passes and for those over pairs."""
-        passes, pairs = ([0, *(end for _, end in own)] for own in (self._passes, self._pairs))
-        return np.array(passes, np.intp), np.array(pairs, np.intp)
-
-    @cached_property
-    def share(self) -> Any:
-        """Return what does the parts of a pass at the same time, an eg_share; null if alone."""
-        pool = self._pool  # not self: the threads end with it
-
-        def together(part: int, work: int, count: int) -> None:
-            call = Part(part)
-            _together(pool, [partial(call, work, k) for k in range(count)])
-
-        return Share() if pool is None else Share(together)
 
     @property
     def factored(self) -> bool:
@@ -189,7 +164,7 @@ class NativeLinearizer:
     def point_costs(self, cameras: Array, points: Array) -> Array:
         """Return the weighted robust sum of each point, (m,); not finite in a focal plane."""
         costs, estimate = np.empty(len(points)), self._estimate(cameras, points)
-        self._each("bundle_costs", *map(address, (*estimate, costs)))
+        self.passes.each("bundle_costs", self.reference, *map(address, (*estimate, costs)))
         return costs
 
     def distances(self, cameras: Array, points: Array) -> Array:
@@ -199,13 +174,15 @@ class NativeLinearizer:
                 return np.asarray(np.linalg.norm(self.residuals(cameras, points), axis=0))
         found, estimate = np.empty(len(self.graph.point)), self._estimate(cameras, points)
         first = np.ascontiguousarray(self.graph.first)
-        self._each("bundle_distances", *map(address, (*estimate, first, found)))
+        self.passes.each(
+            "bundle_distances", self.reference, *map(address, (*estimate, first, found))
+        )
         return found
 
     def intersect(self, cameras: Array) -> Array:
         """Return homogeneous points of least algebraic error, unit vectors (m, 4)."""
         points, inner = np.empty((self.graph.n_points, 4)), self.layout.inward(cameras)
-        self._each("bundle_intersect", address(inner), address(points))
+        self.passes.each("bundle_intersect", self.reference, address(inner), address(points))
         return points
 
     def linearize(self, cameras: Array, points: Array) -> Normal:
@@ -213,7 +190,9 @@ class NativeLinearizer:
         skyline = self.skyline  # the order of the cameras is settled from here on
         estimate, (V, depths, g) = self._estimate(cameras, points), self.room(points)
         before = tuple(map(address, (*estimate, V, depths, g)))
-        (sums,) = self._summed("bundle_linearize", before, (skyline.n, self.camera_sums))
+        (sums,) = self.passes.summed(
+            "bundle_linearize", self.reference, before, (skyline.n, self.camera_sums)
+        )
         return self.gathered(estimate, sums, V, depths, g)
 
     def room(self, points: Array) -> tuple[Array, Array | None, Array]:
@@ -256,7 +235,7 @@ class NativeLinearizer:
         inner, moved = self.layout.inward(cameras), np.array(points, order="C")
         options = self.refinement(how)
         arrays = map(address, (inner, moved, costs, None))
-        self._each("bundle_refine_points", *arrays, ctypes.addressof(options))
+        self.passes.each("bundle_refine_points", self.reference, *arrays, ctypes.addressof(options))
         return moved, costs
 
     def refinement(self, how: PointRefinement) -> Refinement:
@@ -282,7 +261,7 @@ class NativeLinearizer:
                 )
             )
 
-        if any(self._over_points(roots)):
+        if any(self.passes.over(self.graph.n_points, roots)):
             raise np.linalg.LinAlgError("the block of a point is not positive definite")
         return T, half
 
@@ -319,7 +298,7 @@ class NativeLinearizer:
         points = np.empty((*at[1].shape, *x.shape[2:]))
         before = tuple(map(address, (*at, T)))
         after = tuple(map(address, (inner, None, points, None)))
-        self._each("bundle_couple", *before, _columns(x), *after)
+        self.passes.each("bundle_couple", self.reference, *before, _columns(x), *after)
         return points
 
     def to_cameras(self, at: tuple[Array, Array], T: Array | None, y: Array) -> Array:
@@ -327,7 +306,7 @@ class NativeLinearizer:
         T, y = _contiguous(T), np.ascontiguousarray(y)  # C has addresses only: both are kept
         before = (*map(address, (*at, T)), _columns(y), *map(address, (None, y, None)))
         shape = len(at[0]), self.width, *y.shape[2:]
-        found = self._summed("bundle_couple", before, shape)[0]
+        found = self.passes.summed("bundle_couple", self.reference, before, shape)[0]
         return self.spread_out(self.layout.outward(found), 1)
 
     def marginals(
@@ -340,7 +319,7 @@ class NativeLinearizer:
         first = np.ascontiguousarray(graph.first)
         before = (*map(address, (*at, T, cameras.X)), cameras.skyline.reference)
         after = map(address, (found, first, across if coupled else None))
-        self._each("bundle_marginals", *before, *after, pairs=True)
+        self.passes.each("bundle_marginals", self.reference, *before, *after, pairs=True)
         return found, self.spread_out(across, 1)
 
     def schur(
@@ -350,47 +329,10 @@ class NativeLinearizer:
         T, half = np.ascontiguousarray(T), _contiguous(half)
         before = (*map(address, (*at, T, half)), skyline.reference)
         shapes = ((skyline.blocks, self.pair_sums.size), (len(at[0]), self.width))
-        pairs, cameras = self._summed("bundle_schur", before, *shapes, pairs=True)
-        return NativePairs(self, skyline, pairs, self.pair_sums), self.wide(cameras)
-
-    def _each(self, name: str, *arguments: Any, pairs: bool = False) -> None:
-        """Call a C function for all chunks, which write to places of their own.
-
-        `pairs` tells that it works on pairs of observations.
-        """
-        call, ranges = function(name), self._pairs if pairs else self._passes
-        self._share(ranges, lambda _, begin, end: call(self.reference, begin, end, *arguments))
-
-    def _summed(
-        self, name: str, before: tuple[Any, ...], *shapes: tuple[int, ...], pairs: bool = False
-    ) -> list[Array]:
-        """Call a C function for all chunks, which add to its last arguments, arrays of `shapes`.
-
-        `pairs` tells that it works on pairs of observations.
-        """
-        call, ranges = function(name), self._pairs if pairs else self._passes
-        sums = [[aligned_zeros(shape) for shape in shapes] for _ in ranges]
-        self._share(
-            ranges,
-            lambda k, begin, end: call(self.reference, begin, end, *before, *map(address, sums[k])),
+        pairs, cameras = self.passes.summed(
+            "bundle_schur", self.reference, before, *shapes, pairs=True
         )
-        for others in sums[1:]:
-            for total, other in zip(sums[0], others, strict=True):
-                total += other
-        return sums[0]
-
-    def _over_points(self, call: Callable[[slice], Any]) -> list[Any]:
-        """Call a function with as many ranges of points as there are workers."""
-        count, m = len(self._passes), self.graph.n_points
-        edges = [m * k // count for k in range(count + 1)]
-        parts = [slice(begin, end) for begin, end in zip(edges[:-1], edges[1:], strict=True)]
-        return _together(self._pool, [partial(call, part) for part in parts])
-
-    def _share(self, ranges: list[Range], call: Callable[[int, int, int], int]) -> None:
-        for status in _together(
-            self._pool, [partial(call, k, *own) for k, own in enumerate(ranges)]
-        ):
-            checked(status)
+        return NativePairs(self, skyline, pairs, self.pair_sums), self.wide(cameras)
 
 
 def is_direct(skyline: Skyline, n_observations: int) -> bool:
@@ -399,17 +341,6 @@ def is_direct(skyline: Skyline, n_observations: int) -> bool:
         return True
     few = skyline.blocks <= DENSE_CAMERAS * (DENSE_CAMERAS + 1) // 2
     return few and skyline.work <= max(_QUICK, _PATIENCE * n_observations)
-
-
-def _together(pool: ThreadPoolExecutor | None, calls: list[Callable[[], Any]]) -> list[Any]:
-    """Make calls at the same time, the first one here."""
-    if pool is None:
-        return [call() for call in calls]
-    pending = [pool.submit(call) for call in calls[1:]]
-    try:
-        return [calls[0](), *(future.result() for future in pending)]
-    finally:  # C has addresses only: after Ctrl-C, too, the arrays stay until it is done
-        wait(pending)
 
 
 def _columns(x: Array) -> int:

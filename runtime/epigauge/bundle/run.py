@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -28,18 +27,17 @@ from epigauge.bundle.problem import BundleProblem, BundleState, Estimate
 from epigauge.bundle.seeing import seeing
 from epigauge.bundle.similarity import Similarity
 from epigauge.bundle.strategies import STRATEGIES, freedom_of
+from epigauge.bundle.way import Way
 from epigauge.cameras import CameraModel
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
-from epigauge.multi_view.gauge import GAUGES, Gauge, five_points, identity
+from epigauge.multi_view.gauge import Gauge, five_points, identity
 from epigauge.two_view.losses import Loss
 
 __all__ = [
     "bundle_problem",
-    "checked_gauge",
     "conditioned_problem",
     "minimized",
-    "minimized_features",
 ]
 
 Array = NDArray[np.float64]
@@ -148,46 +146,8 @@ def conditioned_problem(
     return home, problem, Estimate(cameras, points, others=others)
 
 
-def checked_gauge(gauge: Any, method: str) -> Gauge | None:
-    """Return a gauge given to a method; a class takes its defaults."""
-    strategy = STRATEGIES[method]
-    if gauge is not None and (strategy.gauge is not None or strategy.reference):
-        raise ArgumentError("gauge", f"is given with method={method!r}", "a method without its own")
-    if isinstance(gauge, type) and issubclass(gauge, GAUGES):
-        gauge = gauge()
-    if gauge is not None and (isinstance(gauge, type) or not hasattr(gauge, "transformation")):
-        raise ArgumentError("gauge", f"is {gauge!r}", "a gauge, such as eg.gauge.normalized()")
-    found: Gauge | None = gauge
-    return found
-
-
 def minimized(
-    job: Job, graph: ObservationGraph, weights: Array, kernels: Table, **how: Any
-) -> tuple[lm.Outcome[BundleState], Array, Array]:
-    """Minimise by a method; return how it ended, and cameras and points in the gauge of the result.
-
-    Arguments are those of `minimized_features`.
-    """
-    outcome, found = minimized_features(job, graph, weights, kernels, **how)
-    return outcome, found.cameras, found.points
-
-
-def minimized_features(
-    job: Job,
-    graph: ObservationGraph,
-    weights: Array,
-    kernels: Table,
-    *,
-    method: str,
-    gauge: Gauge | None,
-    gauge_mode: str,
-    damping: str | None,
-    embedded: bool,
-    schedule: Callable[[], lm.Schedule],
-    loss: Loss,
-    stopping: lm.Stopping,
-    workers: int | Elsewhere,
-    callback: Callable[[lm.Row], object] | None,
+    job: Job, graph: ObservationGraph, weights: Array, kernels: Table, way: Way, loss: Loss
 ) -> tuple[lm.Outcome[BundleState], Estimate]:
     """Minimise by a method; return how it ended, and the estimate in the gauge of the result.
 
@@ -199,15 +159,16 @@ def minimized_features(
     ArgumentError
         On parts that exclude one another, and a start that leaves the steps undetermined.
     """
-    strategy = STRATEGIES[method]
-    name = strategy.damping if damping is None else damping
+    strategy, implicit = STRATEGIES[way.method], way.gauge_mode == "implicit"
+    gauge: Gauge | None = way.gauge
+    name = strategy.damping if way.damping is None else way.damping
     if name in PROJECTIVE_ONLY and not job.model.homogeneous:
-        what = "damping" if damping else "method"
+        what = "damping" if way.damping else "method"
         needed = "a projective start, or another method"
         raise ArgumentError(what, f"is {name!r} for {job.model.name} cameras", needed)
     affine = not (job.model.metric or job.model.homogeneous)
     if affine and strategy.reference:
-        was = f"is {method!r} for {job.model.name} cameras, which have no gauge of that name"
+        was = f"is {way.method!r} for {job.model.name} cameras, which have no gauge of that name"
         others = (name for name, own in STRATEGIES.items() if not own.reference)
         usable = ", ".join(name for name in others if name not in PROJECTIVE_ONLY)
         raise ArgumentError("method", was, f"one of {usable}")
@@ -218,18 +179,18 @@ def minimized_features(
         # Such a step is made for all parameters, free and unconstrained.
         if strategy.reference or strategy.constrained:
             raise ArgumentError(
-                "damping", f"is {name!r} with method={method!r}", "one that adds a matrix"
+                "damping", f"is {name!r} with method={way.method!r}", "one that adds a matrix"
             )
-        if gauge is not None and gauge_mode == "implicit":
+        if gauge is not None and implicit:
             raise ArgumentError(
                 "gauge_mode", "is 'implicit' with a damping that adds no matrix", "'explicit'"
             )
     moving = gauge is not None or strategy.gauge is not None or name == "none"
     if job.fixes_gauge and moving:
-        was = f"leaves the gauge to be chosen, which what is fixed or known does ({method!r})"
+        was = f"leaves the gauge to be chosen, which what is fixed or known does ({way.method!r})"
         raise ArgumentError("method", was, "method='covariant', without a gauge")
     explicit = strategy.gauge if strategy.explicit else gauge
-    if gauge is not None and gauge_mode == "implicit":
+    if gauge is not None and implicit:
         act, explicit = Implicit(act, gauge), None
     chosen: tuple[int, ...] = ()
     own_gauge = strategy.gauge
@@ -255,7 +216,7 @@ def minimized_features(
     def checked(reached: BundleState, begun: Estimate) -> bool:
         """Tell whether the default method finds nothing lower, either."""
         parts = job.model, kernels, graph, job.q, weights, loss
-        free = bundle_problem(*parts, embedded=True, workers=workers, kinds=kinds)
+        free = bundle_problem(*parts, embedded=True, workers=way.workers, kinds=kinds)
         there = BundleState(conditioned(reached.estimate), reached.cost)
         return not far.short_of_minimum(free, there, conditioned(begun))
 
@@ -280,8 +241,8 @@ def minimized_features(
             job.q,
             weights,
             loss,
-            embedded=embedded and strategy.embedded and name == "covariant",
-            workers=workers,
+            embedded=way.embedded and strategy.embedded and name == "covariant",
+            workers=way.workers,
             freedom=freedom_of(
                 strategy, explicit, job.model, kernels, begun.cameras, chosen, job.freedom
             ),
@@ -296,8 +257,8 @@ def minimized_features(
             problem = resident(problem)
         jumps = homogeneous and problem.refinement is not None and gauge is None
         minimize = far.minimize if jumps else lm.minimize
-        unit = job.scale_px**2
-        outcome = minimize(problem, begun, act, schedule(), stopping, callback, unit)
+        how = act, way.rule(job.model), way.stopping, way.callback, job.scale_px**2
+        outcome = minimize(problem, begun, *how)
         outcome = problem.fetched(outcome)
         if homogeneous and home and outcome.system is None and np.isfinite(outcome.state.cost):
             later: Any = partial(problem.linearize, outcome.state)
@@ -317,8 +278,8 @@ def minimized_features(
     except np.linalg.LinAlgError:
         raise ArgumentError(
             "start",
-            f"leaves the steps of method={method!r} undetermined (singular normal equations), and "
-            "so does one a thousandth away",
+            f"leaves the steps of method={way.method!r} undetermined (singular normal equations), "
+            "and so does one a thousandth away",
             "cameras with different centres, points away from them and not in one plane, or "
             "method='covariant'",
         ) from None

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import kernels, lm
-from epigauge._arguments import as_choice, as_positive
+from epigauge._arguments import as_positive
 from epigauge._options import Backend, Schedule
 from epigauge._options import Loss as LossName
 from epigauge._results import Result
@@ -20,6 +20,7 @@ from epigauge.bundle.observations import ObservationGraph
 from epigauge.bundle.refinement import fixed_indices, listed
 from epigauge.bundle.run import minimized
 from epigauge.bundle.ties import Ties
+from epigauge.bundle.way import Way
 from epigauge.cameras import CameraModel, MetricReconstruction, camera_model
 from epigauge.distributed.dispatch import Dispatch
 from epigauge.distributed.linearizer import DistributedLinearizer
@@ -30,10 +31,9 @@ from epigauge.distributed.write_parts import PartsWriter
 from epigauge.errors import ArgumentError
 from epigauge.io._common import PathLike
 from epigauge.kernels import Table
-from epigauge.multi_view.adjust import SCHEDULES
 from epigauge.multi_view.result import told
 from epigauge.multi_view.verdicts.metric import judged_metric
-from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, scale_of_median
+from epigauge.two_view.losses import EFFICIENT, Loss, scale_of_median
 
 __all__ = ["PartsResult", "adjust_parts"]
 
@@ -165,9 +165,14 @@ def adjust_parts(
     for name in others:
         was = "is given with a folder of parts"
         raise ArgumentError(name, was, "the default, or observations as eg.Tracks")
-    as_choice("schedule", schedule, ("auto", *SCHEDULES))
-    as_choice("loss", loss, LOSSES)
-    stopping = lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter)
+    way = Way(
+        embedded=embedded,
+        schedule=schedule,
+        loss=loss,
+        loss_scale_px=loss_scale_px,
+        stopping=lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter),
+        callback=callback,
+    )
     parts, table = Parts.open(folder), kernels.table(backend)
     begun, numbers = parts.start()
     begun = begun if start is None else start
@@ -202,23 +207,9 @@ def adjust_parts(
     if output is not None:  # which is begun when all else is known to be right
         common = parts.unit, parts.whitened, parts.names
         writer = PartsWriter.new(output, parts.n_views, *common, "output", parts.storage)
-    outcome, cameras, points = minimized(
-        job,
-        graph,
-        nothing.weights,
-        table,
-        method="covariant",
-        gauge=None,
-        gauge_mode="explicit",
-        damping=None,
-        embedded=embedded,
-        schedule=SCHEDULES["adaptive" if schedule == "auto" else schedule],
-        loss=Loss(loss, scale_px),
-        stopping=stopping,
-        workers=workers,
-        callback=callback,
-    )
-    found = job.result(cameras, points)
+    way = replace(way, workers=workers)
+    outcome, reached = minimized(job, graph, nothing.weights, table, way, Loss(loss, scale_px))
+    found = job.result(reached.cameras, reached.points)
     assert isinstance(found, MetricReconstruction)
     assert workers.last is not None
     evidence = PartsEvidence(workers.last, found, parts.scale)

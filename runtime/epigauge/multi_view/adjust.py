@@ -3,49 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from dataclasses import replace
 from typing import Any, Literal
 
-import numpy as np
-
 from epigauge import kernels, lm
-from epigauge._arguments import as_choice, as_count, as_positive
+from epigauge._arguments import as_positive
 from epigauge._logged import logged
 from epigauge._options import Backend, BundleDamping, GaugeMode, Method, Schedule
 from epigauge._options import Loss as LossName
-from epigauge.bundle.dampings import DAMPINGS
-from epigauge.bundle.jobs import job_of
-from epigauge.bundle.observations import ObservationGraph, whitened
 from epigauge.bundle.prior_kinds import Prior, listed_priors
 from epigauge.bundle.refinement import fixed_indices, listed
-from epigauge.bundle.run import checked_gauge, minimized
-from epigauge.bundle.strategies import STRATEGIES
-from epigauge.cameras import AffineReconstruction, AnyReconstruction, MetricReconstruction
+from epigauge.bundle.way import Way
+from epigauge.cameras import AnyReconstruction
 from epigauge.errors import ArgumentError
-from epigauge.multi_view.frame import Frame
+from epigauge.multi_view.adjust_points import adjusted_points
 from epigauge.multi_view.gauge import Gauge
 from epigauge.multi_view.initialize import initialize
 from epigauge.multi_view.line_adjust import adjusted_lines
 from epigauge.multi_view.line_tracks import LineTracks
 from epigauge.multi_view.prior_noise import with_estimated_noise
-from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.rejection import without_gross_errors
 from epigauge.multi_view.repeated import merging_sightings
 from epigauge.multi_view.result import BundleResult
 from epigauge.multi_view.tracks import Tracks
-from epigauge.multi_view.verdicts.evidence import EvidenceOfTracks
-from epigauge.multi_view.verdicts.metric import judged_metric
-from epigauge.multi_view.verdicts.projective import judged
-from epigauge.multi_view.verdicts.verdict import Verdict
-from epigauge.two_view.losses import EFFICIENT, LOSSES, Loss, robust_scale
 
 __all__ = ["BundleResult", "bundle_adjust"]
-
-SCHEDULES: dict[str, Callable[[], lm.Schedule]] = {
-    "classic": lm.Classic,
-    "nielsen": lm.Nielsen,
-    "adaptive": lm.Adaptive,
-}
 
 
 @logged
@@ -192,203 +174,50 @@ def bundle_adjust(
     """
     if not isinstance(tracks, Tracks):
         raise ArgumentError("tracks", f"is a {type(tracks).__name__}", "eg.Tracks(...)")
-    fixed_views = listed("fixed_views", fixed_views)
-    fixed_points = listed("fixed_points", fixed_points)
-    priors = None if priors is None else listed_priors(priors)
-    if noise_px != "tracks" and not priors:
-        raise ArgumentError("noise_px", "is given without priors", "priors, or the default")
-    noise_px = tracks.unit if noise_px == "tracks" else noise_px
-    noise_px = noise_px if noise_px is None else as_positive("noise_px", noise_px)
-    if lines is not None and (robust or noise_px is None):
-        name = "robust" if robust else "noise_px"
-        raise ArgumentError(name, "is given with lines", "the default, and a robust loss")
-    if robust or noise_px is None:
-        options: dict[str, Any] = {
-            "refine": refine,
-            "fixed_views": fixed_views,
-            "fixed_points": fixed_points,
-            "priors": priors,
-            "method": method,
-            "gauge": gauge,
-            "gauge_mode": gauge_mode,
-            "damping": damping,
-            "embedded": embedded,
-            "schedule": schedule,
-            "ftol": ftol,
-            "xtol": xtol,
-            "gtol": gtol,
-            "max_iter": max_iter,
-            "workers": workers,
-            "backend": backend,
-            "callback": callback,
-        }
-        if noise_px is None:
-            options.update(robust=robust, loss=loss, loss_scale_px=loss_scale_px)
-
-            def adjusted(noise_px: float, start: Any) -> BundleResult:
-                return bundle_adjust(tracks, start, noise_px=noise_px, **options)
-
-            return with_estimated_noise(adjusted, tracks, start)
-        if priors:
-            options["noise_px"] = noise_px
-        table = kernels.table(backend)
-        start = initialize(tracks, robust=True, backend=backend) if start is None else start
-        last = as_choice("loss", loss, LOSSES), loss_scale_px
-        held = fixed_indices("fixed_views", fixed_views, tracks.n_views)
-        once = partial(bundle_adjust, **options)
-        return without_gross_errors(once, tracks, start, table, last, held)
-    as_choice("method", method, STRATEGIES)
-    as_choice("gauge_mode", gauge_mode, ("explicit", "implicit"))
-    as_choice("schedule", schedule, ("auto", *SCHEDULES))
-    as_choice("loss", loss, LOSSES)
-    if damping is not None:
-        as_choice("damping", damping, DAMPINGS)
-    gauge = checked_gauge(gauge, method)
-    threads = 1
-    if not hasattr(workers, "linearizer"):  # what epigauge.distributed passes
-        workers = threads = as_count("workers", workers)
-    stopping = lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter)
-    if lines is not None:
-        if workers != threads:
-            raise ArgumentError("lines", "are given with workers elsewhere", "none, or one machine")
-        begin = initialize(tracks, backend=backend) if start is None else start
-        mixed = adjusted_lines(
-            tracks,
-            begin,
-            lines,
-            method=method,
-            gauge=gauge,
-            gauge_mode=gauge_mode,
-            damping=damping,
-            loss=loss,
-            loss_scale_px=loss_scale_px,
-            backend=backend,
-            options={
-                "embedded": embedded,
-                "schedule": SCHEDULES["adaptive" if schedule == "auto" else schedule],
-                "stopping": stopping,
-                "callback": callback,
-            },
-            refine=refine,
-            fixed_views=fixed_views,
-            fixed_points=fixed_points,
-            priors=priors,
-            noise_px=noise_px,
-        )
-        outcome, counts = mixed.outcome, tracks.weights > 0.0
-        return BundleResult.unjudged(
-            lambda: mixed.verdict,
-            reconstruction=mixed.reconstruction,
-            rms_px=float(np.sqrt(np.mean(mixed.fun[counts] ** 2))),
-            cost=mixed.cost,
-            fun=mixed.fun,
-            method=method,
-            loss_scale_px=mixed.loss_scale_px,
-            noise_px=noise_px,
-            rejected=np.zeros(len(tracks), dtype=np.bool_),
-            nfev=outcome.nfev,
-            njev=outcome.njev,
-            nit=outcome.nit,
-            status=outcome.status,
-            history=outcome.history,
-            line_fun=mixed.line_fun,
-        )
-    table = kernels.table(backend)
-    start = initialize(tracks, backend=backend) if start is None else start
-    job = job_of(
-        tracks,
-        start,
-        refine=refine,
-        fixed_views=fixed_views,
-        fixed_points=fixed_points,
-        priors=priors,
-        noise_px=noise_px,
-    )
-    by_default = "classic" if job.model.homogeneous else "adaptive"
-    rule = by_default if schedule == "auto" else schedule
-    scale_px = _loss_scale(loss, loss_scale_px, tracks, start)
-    outcome, cameras, points = minimized(
-        job,
-        ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points),
-        np.asarray(tracks.weights),
-        table,
+    way = Way(
         method=method,
         gauge=gauge,
         gauge_mode=gauge_mode,
         damping=damping,
         embedded=embedded,
-        schedule=SCHEDULES[rule],
-        loss=Loss(loss, scale_px / job.scale_px),
-        stopping=stopping,
+        schedule=schedule,
+        loss=loss,
+        loss_scale_px=loss_scale_px,
+        stopping=lm.Stopping(ftol=ftol, xtol=xtol, gtol=gtol, max_iter=max_iter),
         workers=workers,
         callback=callback,
     )
-    reconstruction = job.result(cameras, points)
-    stays = (
-        fixed_indices("fixed_views", fixed_views, tracks.n_views),
-        fixed_indices("fixed_points", fixed_points, tracks.n_points),
-    )
-    if isinstance(reconstruction, MetricReconstruction | AffineReconstruction):
-        fixed = np.zeros(tracks.n_points, dtype=np.bool_)
-        fixed[stays[1]] = True
-        reference = bool(STRATEGIES[method].reference)
-        if isinstance(reconstruction, MetricReconstruction):
-            predicted, depths = reconstruction.seen(tracks)
-        else:
-            predicted, depths = reconstruction.project(tracks), None
-        free = fixed, job.fixes_gauge or reference, loss == "linear"
+    known = None if priors is None else listed_priors(priors)
+    if noise_px != "tracks" and not known:
+        raise ArgumentError("noise_px", "is given without priors", "priors, or the default")
+    unit = tracks.unit if noise_px == "tracks" else noise_px
+    unit = unit if unit is None else as_positive("noise_px", unit)
+    if lines is not None and (robust or unit is None):
+        name = "robust" if robust else "noise_px"
+        raise ArgumentError(name, "is given with lines", "the default, and a robust loss")
+    free: dict[str, Any] = {
+        "refine": refine,
+        "fixed_views": listed("fixed_views", fixed_views),
+        "fixed_points": listed("fixed_points", fixed_points),
+        "priors": known,
+    }
+    table = kernels.table(backend)
+    start = initialize(tracks, robust=robust, backend=backend) if start is None else start
+    if lines is not None:
+        return adjusted_lines(tracks, start, lines, way, table, noise_px=unit, **free)
 
-        def judge() -> Verdict:
-            evidence = EvidenceOfTracks(tracks, Frame.of(tracks).scale, predicted, depths)
-            return judged_metric(evidence, reconstruction, outcome, table, *free)
+    def adjusted(noise_px: float, start: Any) -> BundleResult:
+        if not robust:
+            return adjusted_points(tracks, start, way, table, noise_px=noise_px, **free)
 
-    else:
-        linear = loss == "linear"
-        predicted = reconstruction.project(tracks)
-        how = linear, table, threads, stays if job.fixes_gauge else None
+        def again(tracks: Tracks, start: Any, **loss: Any) -> BundleResult:
+            how = replace(way, **loss)
+            return adjusted_points(tracks, start, how, table, noise_px=noise_px, **free)
 
-        def judge() -> Verdict:
-            # The arrays of the result can be written to: what is judged is what was found.
-            found, none = job.result(cameras, points), np.zeros(len(tracks), np.bool_)
-            assert isinstance(found, Reconstruction)
-            system: Any = outcome.system if linear else None
-            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-                system = system() if callable(system) else system
-            return judged(tracks, found, none, *how, system)
+        last = way.loss, way.loss_scale_px
+        held = fixed_indices("fixed_views", free["fixed_views"], tracks.n_views)
+        return without_gross_errors(again, tracks, start, table, last, held)
 
-    residuals, counts = tracks.xy - predicted, tracks.weights > 0.0
-    counted = residuals if counts.all() else residuals[counts]
-    result = BundleResult.unjudged(
-        judge,
-        reconstruction=reconstruction,
-        rms_px=float(np.sqrt(np.vdot(counted, counted) / counted.size)),
-        cost=outcome.state.cost * job.scale_px**2,
-        fun=residuals,
-        method=method,
-        loss_scale_px=scale_px,
-        noise_px=noise_px,
-        rejected=np.zeros(len(tracks), dtype=np.bool_),
-        nfev=outcome.nfev,
-        njev=outcome.njev,
-        nit=outcome.nit,
-        status=outcome.status,
-        history=outcome.history,
-    )
-    if workers != 1:
-        result.judge()  # while the workers are there: threads do not outlive a fork
-    return result
-
-
-def _loss_scale(
-    loss: str,
-    loss_scale_px: float | str,
-    tracks: Tracks,
-    start: AnyReconstruction,
-) -> float:
-    if loss == "linear":
-        return 0.0
-    if loss_scale_px != "auto":
-        return as_positive("loss_scale_px", loss_scale_px)
-    residuals = whitened(tracks.whitening, (tracks.xy - start.project(tracks)).T)
-    distances = np.linalg.norm(residuals, axis=0)
-    return EFFICIENT[loss] * max(robust_scale(distances[tracks.weights > 0.0]), 1e-12)
+    if unit is None:
+        return with_estimated_noise(adjusted, tracks, start)
+    return adjusted(unit, start)

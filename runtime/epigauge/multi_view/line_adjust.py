@@ -8,28 +8,26 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from epigauge import kernels, lm
-from epigauge._arguments import as_positive
 from epigauge.bundle.jobs import Job, job_of
 from epigauge.bundle.moves import Move
-from epigauge.bundle.observations import ObservationGraph, whitened
-from epigauge.bundle.problem import BundleProblem, BundleState, Estimate
-from epigauge.bundle.run import bundle_problem, conditioned_problem, minimized_features
+from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.problem import BundleProblem, Estimate
+from epigauge.bundle.run import conditioned_problem, minimized
+from epigauge.bundle.way import Way, loss_scale
 from epigauge.cameras import MetricReconstruction
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 from epigauge.multi_view.frame import Frame
-from epigauge.multi_view.gauge import Gauge
 from epigauge.multi_view.line_agreement import BEYOND, lengths, usual
 from epigauge.multi_view.line_start import SeenLines, refuse_absurd, seen_lines, triangulated
 from epigauge.multi_view.line_tracks import LineTracks
 from epigauge.multi_view.line_verdict import LinesFound, judged_lines
 from epigauge.multi_view.reconstruction import Reconstruction
+from epigauge.multi_view.result import BundleResult
 from epigauge.multi_view.tracks import Tracks
-from epigauge.multi_view.verdicts.verdict import Verdict
-from epigauge.two_view.losses import EFFICIENT, Loss, robust_scale
+from epigauge.two_view.losses import Loss
 
-__all__ = ["Adjusted", "LineProblem", "adjusted_lines", "line_job", "line_problem"]
+__all__ = ["LineProblem", "adjusted_lines", "graph_of", "line_job", "line_problem"]
 
 Array = NDArray[np.float64]
 
@@ -44,18 +42,6 @@ class LineProblem(NamedTuple):
     problem: BundleProblem
     start: Estimate
     home: Move
-
-
-class Adjusted(NamedTuple):
-    """What an adjustment of points and lines found."""
-
-    reconstruction: MetricReconstruction | Reconstruction
-    outcome: lm.Outcome[BundleState]
-    fun: Array
-    line_fun: Array
-    verdict: Verdict
-    cost: float
-    loss_scale_px: float
 
 
 def line_job(
@@ -145,43 +131,21 @@ def _first_lines(seen: SeenLines, given: Array | None, table: Table) -> Array:
 
 
 def adjusted_lines(
-    tracks: Tracks,
-    start: Any,
-    lines: LineTracks,
-    *,
-    method: str,
-    gauge: Gauge | None,
-    gauge_mode: str,
-    damping: str | None,
-    loss: str,
-    loss_scale_px: float | str,
-    backend: str | None,
-    options: dict[str, Any],
-    **free: Any,
-) -> Adjusted:
+    tracks: Tracks, start: Any, lines: LineTracks, way: Way, table: Table, **free: Any
+) -> BundleResult:
     """Adjust cameras, points and lines; see `eg.bundle_adjust`."""
-    for name, value in (("method", method), ("damping", damping)):
+    if not isinstance(way.workers, int):
+        raise ArgumentError("lines", "are given with workers elsewhere", "none, or one machine")
+    for name, value in (("method", way.method), ("damping", way.damping)):
         if value in _WITHOUT:
             raise ArgumentError(name, f"is {value!r} with lines", "another one: 'covariant'")
-    if gauge_mode != "explicit":
-        raise ArgumentError("gauge_mode", f"is {gauge_mode!r} with lines", "'explicit'")
-    table = kernels.table(backend)
+    if way.gauge_mode != "explicit":
+        raise ArgumentError("gauge_mode", f"is {way.gauge_mode!r} with lines", "'explicit'")
     job = line_job(tracks, start, lines, table, **free)
-    scale_px = _loss_scale(job, tracks, loss, loss_scale_px, table)
-    robust = Loss(loss, scale_px / job.scale_px)
-    outcome, reached = minimized_features(
-        job,
-        graph_of(tracks),
-        np.asarray(tracks.weights),
-        table,
-        method=method,
-        gauge=gauge,
-        gauge_mode=gauge_mode,
-        damping=damping,
-        loss=robust,
-        workers=1,
-        **options,
-    )
+    scale_px = loss_scale(way, job, tracks, start)
+    robust, way = Loss(way.loss, scale_px / job.scale_px), replace(way, workers=1)
+    weights = np.asarray(tracks.weights)
+    outcome, reached = minimized(job, graph_of(tracks), weights, table, way, robust)
     (kind,) = job.kinds
     whole = job.result(reached.cameras, reached.points)
     assert isinstance(whole, MetricReconstruction | Reconstruction)
@@ -193,34 +157,21 @@ def adjusted_lines(
         predicted, depths = found.project(tracks), None
     views, points = (np.asarray([*free[name]], np.intp) for name in ("fixed_views", "fixed_points"))
     parts = LinesFound(tracks, lines, job, reached, found, depths, views, points)
-    return Adjusted(
-        found,
+    verdict = judged_lines(parts, table, robust, bool(np.isfinite(outcome.state.cost)))
+    return BundleResult.unjudged(
+        lambda: verdict,
         outcome,
+        tracks,
         tracks.xy - predicted,
-        np.ascontiguousarray(line_fun.T),
-        judged_lines(parts, table, robust, bool(np.isfinite(outcome.state.cost))),
-        outcome.state.cost * job.scale_px**2,
-        scale_px,
+        reconstruction=found,
+        cost=outcome.state.cost * job.scale_px**2,
+        method=way.method,
+        loss_scale_px=scale_px,
+        noise_px=free["noise_px"],
+        line_fun=np.ascontiguousarray(line_fun.T),
     )
 
 
 def graph_of(tracks: Tracks) -> ObservationGraph:
     """Return which observation of points belongs to what."""
     return ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
-
-
-def _loss_scale(
-    job: Job, tracks: Tracks, loss: str, loss_scale_px: float | str, table: Table
-) -> float:
-    """Return the scale of the loss in pixels, by default from the residuals of the start."""
-    if loss == "linear":
-        return 0.0
-    if loss_scale_px != "auto":
-        return as_positive("loss_scale_px", loss_scale_px)
-    parts = job.model, table, graph_of(tracks), job.q, np.asarray(tracks.weights)
-    problem = bundle_problem(*parts, kinds=job.kinds)
-    points = whitened(tracks.whitening, problem.linearizer.residuals(job.cameras, job.points))
-    (kind,) = job.kinds
-    both = points[:, tracks.weights > 0.0], kind.residuals(job.cameras, job.others[0])
-    sizes = np.linalg.norm(np.concatenate(both, axis=1), axis=0)
-    return EFFICIENT[loss] * job.scale_px * max(robust_scale(sizes), 1e-12)

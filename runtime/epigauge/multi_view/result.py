@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -119,18 +120,45 @@ class BundleResult(Result):
     line_fun: Array | None = field(default=None, repr=False)
 
     @classmethod
-    def unjudged(cls, judge: Callable[[], Verdict], **known: Any) -> BundleResult:
+    def unjudged(
+        cls,
+        judge: Callable[[], Verdict],
+        outcome: lm.Outcome[Any],
+        tracks: Tracks,
+        residuals: Array,
+        **known: Any,
+    ) -> BundleResult:
         """Return a result that is judged when its verdict is first asked for.
 
         Parameters
         ----------
         judge : callable
             Returns the verdict.
+        outcome : Outcome
+            How the minimisation ended.
+        tracks : Tracks
+            What was adjusted.
+        residuals : ndarray, shape (N, 2)
+            Of the points.
         **known
-            All fields that do not depend on it.
+            All other fields that do not depend on the verdict.
         """
+        counts = tracks.weights > 0.0
+        counted = residuals if counts.all() else residuals[counts]
         made = object.__new__(cls)
-        made.__dict__.update(known, _judge=judge, _judging=threading.Lock())
+        made.__dict__.update(
+            known,
+            rms_px=math.sqrt(np.vdot(counted, counted) / counted.size),
+            fun=residuals,
+            rejected=np.zeros(len(residuals), dtype=np.bool_),
+            nfev=outcome.nfev,
+            njev=outcome.njev,
+            nit=outcome.nit,
+            status=outcome.status,
+            history=outcome.history,
+            _judge=judge,
+            _judging=threading.Lock(),
+        )
         return made
 
     def judge(self) -> None:
