@@ -238,6 +238,70 @@ def test_a_wrong_segment_counts_less_under_a_robust_loss(scene: eg.LineScene) ->
     assert linear.noise_px > 2.0
 
 
+def test_priors_count_beside_lines_as_in_a_dense_inverse(scene: eg.LineScene) -> None:
+    tracks, lines, true, noise = scene.tracks, scene.line_tracks, scene.true, 1.5
+    length = float(np.linalg.norm(true.X[2] - true.X[9]))
+    priors = [
+        *(eg.PositionPrior(i, true.centres[i], 0.05) for i in (0, 2)),
+        eg.PointPrior(4, true.X[4], 0.02),
+        eg.Distance(2, 9, length, 0.01),
+    ]
+    found = adjusted(scene, priors=priors)
+    options: dict[str, Any] = {"noise_px": noise, "refine": "pose", "lines": lines}
+    cov = eg.covariance(tracks, found, priors=priors, **options)
+    assert cov.open == 0
+    made = line_problem(tracks, found, lines, table(), refine="pose")
+    at, job, scale = made.start, made.job, made.home.scale
+    graph = ObservationGraph(tracks.view, tracks.point, 5, 12)
+    parts = job.model, table(), graph, job.q, np.ones(60), Loss()
+    _, A, B = NumpyLinearizer(*parts).observe(at.cameras, at.points)
+    (kind,) = made.problem.kinds
+    assert isinstance(kind, LineLinearizer)
+    _, A_lines, B_lines = kind.observe(at.cameras, at.others[0])
+    size = 6 * 5 + 3 * 12 + 4 * 8
+    J = np.zeros((2, 100, size))
+    for k in range(100):
+        i = (tracks.view if k < 60 else lines.view)[k % 60]
+        J[:, k, 6 * i : 6 * i + 6] = (A if k < 60 else A_lines)[:, :6, k % 60]
+        first = 30 + 3 * tracks.point[k] if k < 60 else 66 + 4 * lines.line[k - 60]
+        width = 3 if k < 60 else 4
+        J[:, k, first : first + width] = (B if k < 60 else B_lines)[:, :, k % 60]
+
+    def known(step: Array) -> Array:
+        """Return what is known after a step, each number over its deviation."""
+        own = np.zeros((5, at.cameras.shape[1] - 12 + 6))
+        own[:, :6] = step[:30].reshape(5, 6)
+        pose = made.problem.retraction(at.cameras, own)[:, :12].reshape(5, 3, 4)
+        centres = -np.einsum("nji,nj->ni", pose[:, :, :3], pose[:, :, 3])
+        X = at.points + step[30:66].reshape(12, 3)
+        away = np.linalg.norm(X[2] - X[9])
+        return np.concatenate([*(centres[i] / 0.05 for i in (0, 2)), X[4] / 0.02, [away / 0.01]])
+
+    h = 1e-6
+    slopes = [(known(h * row) - known(-h * row)) / (2.0 * h) for row in np.eye(size)]
+    rows = np.concatenate([J.reshape(-1, size), noise / scale * np.transpose(slopes)])
+    X = noise**2 * np.linalg.inv(rows.T @ rows)
+    for k in (0, 5):
+        own = slice(66 + 4 * k, 70 + 4 * k)
+        np.testing.assert_allclose(cov.line_update(k), X[own, own], rtol=1e-5, atol=1e-12)
+    turn = made.home.rotation / scale
+    for j in (4, 9):
+        own = slice(30 + 3 * j, 33 + 3 * j)
+        np.testing.assert_allclose(cov.point(j), turn.T @ X[own, own] @ turn, rtol=1e-5, atol=1e-12)
+
+
+def test_a_firm_prior_is_a_fixed_view_for_lines_too(
+    scene: eg.LineScene, found: eg.MetricReconstruction
+) -> None:
+    options: dict[str, Any] = {"noise_px": 1.0, "refine": "pose", "lines": scene.line_tracks}
+    firm = [eg.PositionPrior(1, found.centres[1], 1e-7), eg.RotationPrior(1, found.R[1], 1e-7)]
+    held = eg.covariance(scene.tracks, found, fixed_views=[1], **options)
+    known = eg.covariance(scene.tracks, found, priors=firm, **options)
+    assert held.open == known.open == 1
+    for k in range(8):
+        np.testing.assert_allclose(known.line_update(k), held.line_update(k), rtol=1e-4, atol=1e-12)
+
+
 def test_what_is_asked_wrongly_is_named(
     scene: eg.LineScene, found: eg.MetricReconstruction, cov: eg.MetricCovariance
 ) -> None:
@@ -247,9 +311,6 @@ def test_what_is_asked_wrongly_is_named(
         eg.covariance(tracks, without, lines=lines)
     with pytest.raises(eg.ArgumentError, match="LineTracks"):
         eg.covariance(tracks, found, lines=tracks)  # type: ignore[call-overload]
-    priors = [eg.PositionPrior(0, [0, 0, 0], 1.0)]
-    with pytest.raises(eg.ArgumentError, match="priors are given with lines"):
-        eg.covariance(tracks, found, lines=lines, priors=priors)
     with pytest.raises(eg.ArgumentError, match="line 0 to 7"):
         cov.line(8)
     with pytest.raises(eg.ArgumentError, match="parallel"):

@@ -3,6 +3,9 @@
 Each adds 0.5 e^T covariance^-1 e to the cost, e the deviation from what is known. Observations
 count with the `noise_px` of `bundle_adjust`: by default the `sigma` of the tracks or, without one,
 as if measured with one pixel (and weight one).
+
+Rows of points, and their tangents, may be longer than three, as features are where lines stand
+beside points: it is the first three entries that priors are on.
 """
 
 from __future__ import annotations
@@ -203,24 +206,24 @@ class Priors:
         np.add.at(g_cameras[:, :3], self.turned, np.einsum("kij,kj->ki", turned, w))
         np.add.at(U, (self.cameras, 6 + self.params, 6 + self.params), self.precisions)
         np.add.at(g_cameras, (self.cameras, 6 + self.params), self.precisions * k)
-        np.add.at(V, self.points, self.point_information)
-        np.add.at(g_points, self.points, np.einsum("kij,kj->ki", self.point_information, x))
+        np.add.at(V[:, :3, :3], self.points, self.point_information)
+        np.add.at(g_points[:, :3], self.points, np.einsum("kij,kj->ki", self.point_information, x))
         along, lengths = self._along(points)
         pull = (self.length_precisions * (lengths - self.lengths))[:, None] * along
-        np.add.at(g_points, self.ends[:, 0], pull)
-        np.add.at(g_points, self.ends[:, 1], -pull)
+        np.add.at(g_points[:, :3], self.ends[:, 0], pull)
+        np.add.at(g_points[:, :3], self.ends[:, 1], -pull)
         return replace(normal, U=U, V=V, g_cameras=g_cameras, g_points=g_points)
 
-    def border(self, n: int, d: int, points: Array) -> Border | None:
+    def border(self, normal: Normal, points: Array) -> Border | None:
         """Return what known distances add to J^T J: they couple points."""
         if not len(self.ends):
             return None
         count = len(self.ends)
-        columns = np.zeros((len(points), 3, count))
+        columns = np.zeros((*normal.g_points.shape, count))
         along = np.sqrt(self.length_precisions)[:, None] * self._along(points)[0]
-        columns[self.ends[:, 0], :, np.arange(count)] = along
-        columns[self.ends[:, 1], :, np.arange(count)] = -along
-        return Border(np.zeros((n, d, count)), columns)
+        columns[self.ends[:, 0], :3, np.arange(count)] = along
+        columns[self.ends[:, 1], :3, np.arange(count)] = -along
+        return Border(np.zeros((*normal.g_cameras.shape, count)), columns)
 
     def slopes(self, cameras: Array, points: Array, of_cameras: Array, of_points: Array) -> Array:
         """Return how what is known changes with motions, unweighted.
@@ -229,7 +232,7 @@ class Priors:
         ----------
         cameras, points : ndarray, shape (n, c), (m, 3)
             The estimate.
-        of_cameras, of_points : ndarray, shape (n, d, g), (m, 3, g)
+        of_cameras, of_points : ndarray, shape (n, d, g), (m, b, g)
             Motions of the gauge, as own tangents.
 
         Returns
@@ -239,7 +242,7 @@ class Priors:
         """
         R = cameras[self.views, :12].reshape(-1, 3, 4)[:, :, :3]
         centres = np.swapaxes(R, 1, 2) @ of_cameras[self.views, 3:6]
-        g = of_points.shape[2]
+        of_points, g = of_points[:, :3], of_points.shape[2]
         turns = self._turns(cameras)[1] @ of_cameras[self.turned, :3]
         blocks = [centres.reshape(-1, g), turns.reshape(-1, g)]
         blocks.append(of_points[self.points].reshape(-1, g))
@@ -250,7 +253,7 @@ class Priors:
 
     def _along(self, points: Array) -> tuple[Array, Array]:
         """Return unit vectors from the second to the first end, and their distances."""
-        apart = points[self.ends[:, 0]] - points[self.ends[:, 1]]
+        apart = points[self.ends[:, 0], :3] - points[self.ends[:, 1], :3]
         lengths = np.linalg.norm(apart, axis=1)
         return apart / np.maximum(lengths, 1e-300)[:, None], lengths
 
@@ -271,7 +274,8 @@ class Priors:
         pose = cameras[self.views, :12].reshape(-1, 3, 4)
         centres = -np.einsum("kji,kj->ki", pose[:, :, :3], pose[:, :, 3])
         known = cameras[self.cameras, 12 + self.params]
-        return centres - self.positions, points[self.points] - self.places, known - self.values
+        places = points[self.points, :3]
+        return centres - self.positions, places - self.places, known - self.values
 
 
 def _stacked(

@@ -156,8 +156,7 @@ class BundleProblem:
         if self.priors is not None:
             normal = self.priors.added(normal, cameras, points)
         normal, border = self.freedom.constrained(normal, cameras, points)
-        n, d = normal.g_cameras.shape
-        known = None if self.priors is None else self.priors.border(n, d, points)
+        known = None if self.priors is None else self.priors.border(normal, points)
         border = known if border is None else border.beside(known)
         ties = self.freedom.ties_at(cameras, points)
         return BundleSystem(

@@ -15,6 +15,7 @@ from epigauge.bundle.lines import LineLinearizer
 from epigauge.bundle.null_space import generators
 from epigauge.bundle.numpy_linearizer import NumpyLinearizer, inverse_roots
 from epigauge.bundle.observations import ObservationGraph
+from epigauge.bundle.priors import Priors
 from epigauge.bundle.solve import BundleSystem
 from epigauge.bundle.ties import Ties
 
@@ -103,17 +104,23 @@ class FeatureLinearizer(NumpyLinearizer):
         views, W = self.of_points.coupling_of(cameras, X, point)
         return views, np.pad(W, ((0, 0), (0, 0), (0, _TANGENT - W.shape[2])))
 
-    def system(self, ties: Ties, cameras: Array, features: Array) -> BundleSystem:
+    def system(
+        self, ties: Ties, cameras: Array, features: Array, priors: Priors | None = None
+    ) -> BundleSystem:
         """Return the normal equations, the ties being those of cameras and points."""
         m, count = self.of_points.graph.n_points, len(features)
         C = np.tile(np.eye(_TANGENT), (count, 1, 1))
         C[:m, 3, 3] = 0.0
         if ties.C is not None:
             C[:m, :3, :3] = ties.C
+        normal = self.linearize(cameras, features)
+        if priors is not None:
+            normal = priors.added(normal, cameras, features)
         return BundleSystem(
-            self.linearize(cameras, features),
+            normal,
             inverse_roots,
             replace(ties, C=C),
+            None if priors is None else priors.border(normal, features),
             model=self.model,
             cameras=cameras,
             points=features,

@@ -68,12 +68,10 @@ def metric_covariance(
         "fixed_points": listed("fixed_points", fixed_points),
     }
     table = kernels.table(backend)
+    free |= {"priors": priors, "noise_px": tracks.unit if noise_px is None else noise_px}
     if lines is None:
-        unit = tracks.unit if noise_px is None else noise_px
-        job = metric_job(tracks, reconstruction, priors=priors, noise_px=unit, **free)
+        job = metric_job(tracks, reconstruction, **free)
         network = _of_points(tracks, job, table)
-    elif priors is not None:
-        raise ArgumentError("priors", "are given with lines", "none, or no lines")
     else:
         network = _of_lines(tracks, reconstruction, lines, table, free)
     known, weights, at = network.priors, network.weights, network.at
@@ -179,7 +177,7 @@ def _of_lines(
         was = "is given, and the reconstruction has no lines"
         raise ArgumentError("lines", was, "what was adjusted: eg.bundle_adjust(..., lines=lines)")
     made = line_problem(tracks, scene, lines, table, **free)
-    job, at, home = made.job, made.start, made.home
+    job, at, home, priors = made.job, made.start, made.home, made.problem.priors
     assert isinstance(home, Similarity)
     graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
     parts = job.model, table, graph, job.q, np.asarray(tracks.weights), Loss()
@@ -191,13 +189,15 @@ def _of_lines(
     def normal(weights: Array) -> tuple[float, BundleSystem, NumpyLinearizer]:
         own = whole.reweighted(weights)
         cost = 0.5 * float(np.sum(own.point_costs(at.cameras, rows)))
-        return cost, own.system(job.freedom.ties, at.cameras, rows), own
+        if priors is not None:
+            cost += priors.cost(at.cameras, rows)
+        return cost, own.system(job.freedom.ties, at.cameras, rows, priors), own
 
     def motions(system: BundleSystem, reference: NumpyLinearizer) -> Motions:
-        return Motions.along_gauge(system, None, *whole.generators(at.cameras, rows))
+        return Motions.along_gauge(system, priors, *whole.generators(at.cameras, rows))
 
     weights = whole.weights
-    return _Network(home, Estimate(at.cameras, rows), weights, None, normal, motions)
+    return _Network(home, Estimate(at.cameras, rows), weights, priors, normal, motions)
 
 
 def redundancy_of(
