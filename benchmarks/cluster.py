@@ -1,15 +1,18 @@
 """Bundle adjustment by processes of a Dask cluster on this machine, beside that in one process.
 
     python benchmarks/cluster.py [--observations 200000] [--steps 3] [--rounds 3]
+    python benchmarks/cluster.py --ceiling [--observations 200000]
     python benchmarks/cluster.py --parts [--observations 10000000 --views 5000] [--memory-limit MB]
 
 A street: views along a curve, each point seen by eight neighbours, cameras of the model `bal` with
 parameters of their own. First, without `--parts`: the milliseconds of a step in this process (one
 thread), by one worker and by two, best of several rounds in turns; what a step takes of processor
 time, in this process and in the busiest worker; and by how much cost and points differ. With
-`--parts`: observations are generated part by part, written to a folder and adjusted from there by
-two workers; the time of a step, and the most memory that all processes together have held, are told
-beside the time of a step of the same kind in one process, from a tenth of the observations.
+`--ceiling`: what two processes can be at most on this machine. A process adjusts half of the views
+on its own, and beside another one that does the same: they share memory and caches, and no work.
+With `--parts`: observations are generated part by part, written to a folder and adjusted from there
+by two workers; the time of a step, and the most memory that all processes together have held, are
+told beside the time of a step of the same kind in one process, from a tenth of the observations.
 """
 
 from __future__ import annotations
@@ -21,6 +24,8 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, wait
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -179,6 +184,37 @@ def speeds(observations: int, views: int, steps: int, rounds: int) -> None:
     print(f"\ntwo workers against one: {ratio:.2f}; overhead of one worker: {100 * overhead:.0f} %")
 
 
+_HERE: list[Any] = []
+
+
+def prepare(observations: int, views: int) -> None:
+    """Keep tracks and start in this process."""
+    _HERE[:] = whole(observations, views)
+
+
+def own_step(steps: int) -> float:
+    """Return the seconds of a step of what this process keeps."""
+    return a_step(eg.bundle_adjust(*_HERE, max_iter=steps, ftol=0.0))
+
+
+def ceiling(observations: int, views: int, steps: int, rounds: int) -> None:
+    """Time steps of half of the views in a process, alone and beside another one."""
+    context = get_context("spawn")
+    pools = [ProcessPoolExecutor(1, mp_context=context) for _ in range(2)]
+    alone, both = [], []
+    with pools[0], pools[1]:
+        wait([pool.submit(prepare, observations // 2, views // 2) for pool in pools])
+        for _ in range(rounds):
+            alone.append(pools[0].submit(own_step, steps).result())
+            side = [pool.submit(own_step, steps) for pool in pools]
+            both.append(max(future.result() for future in side))
+    print(
+        f"half of {observations} observations: {1e3 * min(alone):.0f} ms a step in a process alone,"
+    )
+    print(f"{1e3 * min(both):.0f} beside another one that has the other half: two processes that")
+    print(f"share no work are at most {2.0 * min(alone) / min(both):.2f} times as fast as one here")
+
+
 def parts(observations: int, views: int, steps: int, limit: int | None) -> None:
     """Adjust a folder of parts by two workers, and measure the memory."""
     true = cameras(views)
@@ -209,6 +245,7 @@ def main() -> int:
     parser.add_argument("--views", type=int, help="by default one for 2,000 observations")
     parser.add_argument("--steps", type=int, default=3)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--ceiling", action="store_true", help="two processes side by side")
     parser.add_argument("--parts", action="store_true", help="a folder, by two workers")
     parser.add_argument("--memory-limit", type=int, metavar="MB", help="of each worker")
     options = parser.parse_args()
@@ -218,7 +255,8 @@ def main() -> int:
         limit = None if options.memory_limit is None else 1_000_000 * options.memory_limit
         parts(options.observations, views, options.steps, limit)
     else:
-        speeds(options.observations, views, options.steps, options.rounds)
+        does = ceiling if options.ceiling else speeds
+        does(options.observations, views, options.steps, options.rounds)
     return 0
 
 
