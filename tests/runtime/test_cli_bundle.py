@@ -149,7 +149,7 @@ def test_images_of_bal_files_have_y_up(run, tmp_path, monkeypatch, suffix, optio
         told.append(y_up)
         return display(*arguments, y_up=y_up)
 
-    monkeypatch.setattr(sys.modules["epigauge.cli.bundle"], "display", spy)
+    monkeypatch.setattr("epigauge.cli._tracks.display", spy)
     tracks = eg.Tracks(SCENE.tracks.view, SCENE.tracks.point, -SCENE.tracks.xy)
     start = eg.Reconstruction(np.diag([-1.0, -1.0, 1.0]) @ SCENE.true.P, SCENE.true.Q)
     path = tmp_path / f"t{suffix}"

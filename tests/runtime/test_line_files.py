@@ -175,11 +175,59 @@ def test_what_lines_do_not_go_with_is_refused(
     assert not (folder / "model").exists()
 
 
-def test_tracks_alone_take_no_lines(folder: Path, scene: eg.LineScene, run: Any) -> None:
+def test_lines_are_adjusted_with_tracks_alone(folder: Path, scene: eg.LineScene, run: Any) -> None:
     eg.save_tracks(folder / "tracks.csv", scene.tracks)
-    code, _, err = run("bundle", folder / "tracks.csv", "--lines", folder / "lines.csv")
+    words = "bundle", folder / "tracks.csv", "--lines", folder / "lines.csv"
+    outputs = [folder / f"r.{suffix}" for suffix in ("npz", "ply", "csv")]
+    code, out, err = run(*words, *(word for path in outputs for word in ("-o", path)))
+    assert code == 0
+    expected = eg.bundle_adjust(scene.tracks, lines=scene.line_tracks, callback=lambda row: None)
+    P = np.loadtxt(out.splitlines()).reshape(-1, 3, 4)
+    np.testing.assert_array_equal(P, expected.reconstruction.P)
+    assert "9, 45 segments" in err
+    # Everything comes back, and a run from there has nothing left to do.
+    again = eg.load_reconstruction(outputs[0])
+    np.testing.assert_array_equal(again.lines, expected.reconstruction.lines)
+    words = "bundle", outputs[0], "--lines", folder / "lines.csv"
+    code, out, _ = run(*words, "--start", outputs[0], "--json")
+    found = json.loads(out)
+    assert found["history"][0]["cost"] == pytest.approx(expected.cost, rel=1e-9)
+    assert found["n_lines"] == 9
+    table = (folder / "r.lines.csv").read_text().splitlines()
+    assert len(table) == 46
+    row = np.array(table[1].split(",")[6:], float)
+    np.testing.assert_array_equal(row, expected.line_fun[0])
+    assert b"element edge 9" in outputs[1].read_bytes()
+    # Without segments the lines of the file would be lost, and COLMAP has no place for them.
+    words_without = "bundle", outputs[0], "--start", outputs[0]
+    assert "their segments: --lines FILE" in " ".join(run(*words_without)[2].split())
+    assert "--colmap is given with lines" in run(*words, "--colmap", folder / "model")[2]
+    assert not (folder / "model").exists()
+
+
+def test_lines_name_the_views_of_files_with_gaps(
+    folder: Path, scene: eg.LineScene, run: Any
+) -> None:
+    tracks, lines = scene.tracks, scene.line_tracks
+    text = "\n".join(
+        f"{3 * i + 2},{j},{x!r},{y!r}"
+        for i, j, (x, y) in zip(
+            tracks.view.tolist(), tracks.point.tolist(), tracks.xy.tolist(), strict=True
+        )
+    )
+    (folder / "gaps.csv").write_text(text + "\n")
+    found = eg.load_tracks(folder / "gaps.csv")
+    eg.save_line_tracks(folder / "gaps.lines.csv", lines, found)
+    assert "\n14,0," in (folder / "gaps.lines.csv").read_text()
+    assert same(eg.load_line_tracks(folder / "gaps.lines.csv", found), lines)
+    words = "bundle", folder / "gaps.csv", "--lines"
+    assert run(*words, folder / "gaps.lines.csv")[0] == 0
+    # Numbers from 0 would be other views, without a word.
+    code, _, err = run(*words, folder / "lines.csv")
     assert code == 2
-    assert "--lines is given with tracks" in err
+    assert "view is '0', needed: a name of the 5 views" in " ".join(err.split())
+    eg.save_line_tracks(folder / "gaps.npz", lines)
+    assert "--lines is 'gaps.npz', whose views have no names" in run(*words, folder / "gaps.npz")[2]
 
 
 def test_pieces_are_what_the_views_show(scene: eg.LineScene) -> None:
@@ -197,6 +245,11 @@ def test_pieces_are_what_the_views_show(scene: eg.LineScene) -> None:
     segments[0, :2] += 5.0 * (segments[0, :2] - segments[0, 2:])
     wrong = eg.LineTracks(scene.line_tracks.view, scene.line_tracks.line, segments)
     assert np.abs(line_pieces(wrong, scene.true) - pieces).max() < 1.0
+    # Images decide where they end: a basis does not.
+    T = np.random.default_rng(0).normal(size=(4, 4))
+    moved = eg.gauge.transform(scene.true.to_projective(), T)
+    ends = line_pieces(scene.line_tracks, moved) @ T.T
+    np.testing.assert_allclose(ends[..., :3] / ends[..., 3:], pieces, rtol=1e-9, atol=1e-9)
 
 
 def test_a_cloud_without_edges_is_as_before(tmp_path: Path) -> None:

@@ -29,13 +29,13 @@ from epigauge.cli._common import (
     told,
     write_json,
 )
+from epigauge.cli._lines import arrays_beside, check_kept, line_facts, save_residuals_beside
 from epigauge.cli._live import watching
-from epigauge.cli._tables import save_line_residuals, save_residuals
+from epigauge.cli._tables import save_residuals
 from epigauge.cli._targets import PICTURES, Targets, check_folder, save_drawing
 from epigauge.errors import ArgumentError
 from epigauge.io import SceneSource, load_line_tracks, load_scene, plain, save_ply, save_scene
 from epigauge.io._npz_scene import write_npz_scene
-from epigauge.io.line_files import arrays_of_lines
 from epigauge.io.output import arrays_of_result
 from epigauge.io.scene_files import is_scene_file, scene_content
 from epigauge.multi_view.display import Display, display
@@ -122,9 +122,7 @@ class SceneJob:
             raise ArgumentError("--refine", was, "a scene with calibrated ones, or none")
         self.start = start
         self.lines = None if lines is None else load_line_tracks(lines, self.tracks)
-        if self.start.lines is not None and lines is None:
-            was = f"has {len(self.start.lines)} lines, which would be lost"
-            raise ArgumentError("scene", was, "their segments: --lines FILE")
+        check_kept(self.start, self.lines, "scene")
         model = self.start.cameras.model
         if image_size is not None and model != "bal":
             was = f"is given with cameras of the model {model}"
@@ -306,15 +304,10 @@ class _SceneAnswer:
                 save_cloud(path, scene.X, scene.centres, note, tracks.colours, self.pieces)
             case ".npz":
                 more = arrays_of_result(self.result) | self.more()
-                if self.job.lines is not None:
-                    own = arrays_of_lines(self.job.lines)
-                    more |= {f"line_tracks_{name}": array for name, array in own.items()}
-                write_npz_scene(path, tracks, scene, more)
+                write_npz_scene(path, tracks, scene, more | arrays_beside(self.job.lines))
             case ".csv":
                 save_residuals(path, self.result, tracks)
-                if self.job.lines is not None:
-                    beside = path.with_name(f"{path.stem}.lines.csv")
-                    save_line_residuals(beside, self.result, self.job.lines, tracks)
+                save_residuals_beside(path, self.result, self.job.lines, tracks)
             case _:
                 save_scene(path, *self.job.written(path, scene), rigs=self.job.rigs)
 
@@ -360,12 +353,7 @@ class _SceneAnswer:
             "flags": escape(", ".join(result.flags)) or "none",
             "seconds": f"{self.seconds:.2f}",
         }
-        if self.job.lines is not None and result.line_fun is not None:
-            rms = float(np.sqrt(np.mean(result.line_fun**2)))
-            rows["lines"] = (
-                f"{self.job.lines.n_lines}, {len(self.job.lines)} segments, {rms:.6g} RMS of their "
-                "end points' distances over sigma"
-            )
+        rows |= line_facts(self.job.lines, result)
         if result.n_behind:
             rows["behind"] = f"{result.n_behind} observations of points behind their camera"
         if result.weakest:

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 import epigauge as eg
 from epigauge._arguments import as_choice
@@ -33,13 +29,10 @@ from epigauge.cli._common import (
     Json,
     choice,
     console,
-    facts,
     given,
-    named,
-    shown,
-    told,
     write_json,
 )
+from epigauge.cli._lines import check_kept, segments_of_file
 from epigauge.cli._live import watching
 from epigauge.cli._parts import adjust_folder, refuse
 from epigauge.cli._scenes import (
@@ -49,25 +42,17 @@ from epigauge.cli._scenes import (
     SceneJob,
     of_tracks,
     refuse_options,
-    save_cloud,
 )
-from epigauge.cli._tables import save_residuals
 from epigauge.cli._targets import ImageSize, Plot, Targets, outputs
+from epigauge.cli._tracks import TracksAnswer
 from epigauge.distributed.parts import is_parts
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io import (
     TrackFile,
     load_reconstruction,
     load_track_file,
-    plain,
-    save_colmap_model,
-    save_result,
 )
-from epigauge.io._track_writing import arrays_of
 from epigauge.io.scene_files import is_scene
-from epigauge.multi_view.display import Display, display
-from epigauge.multi_view.pinhole import PinholeModel, pinhole_model
-from epigauge.verdicts import explained, usable
 
 #: Tracks in these files have y down, those of BAL problems y up.
 _Y_DOWN = (".npz", ".csv")
@@ -156,8 +141,8 @@ def bundle(
     lines: Annotated[
         Path | None,
         typer.Option(
-            help="Of a scene: segments of lines to adjust with the points: CSV with view, line, "
-            "x1, y1, x2, y2 and, if you like, sigma; or NPZ.",
+            help="Segments of lines to adjust with the points: CSV with view, line, x1, y1, x2, y2 "
+            "and, if you like, sigma; or NPZ.",
             show_default=False,
         ),
     ] = None,
@@ -241,16 +226,20 @@ def bundle(
         asked["adjust"] = adjuster(scheduler)
         scene = SceneJob(tracks, refine, fix_view or [], rigs, y_up, image_size, lines)
         return scene.run(asked, plot, output, json, precision)
-    for option, value in {"--precision": precision, "--lines": lines}.items():
-        if value is not None:
-            was = "is given with tracks, whose cameras are not calibrated"
-            raise ArgumentError(option, was, "a scene")
+    if precision is not None:
+        was = "is given with tracks, whose cameras are not calibrated"
+        raise ArgumentError("--precision", was, "a scene")
+    if lines is not None and colmap is not None:
+        was = "is given with lines, for which it has no place"
+        raise ArgumentError("--colmap", was, "-o NAME.npz")
     targets = Targets(plot, output, (".npz", ".ply", ".csv"), json=json)
     out = console()
     file = load_track_file(tracks, clean, prune=repeated if prune else None)
+    segments = None if lines is None else segments_of_file(lines, file)
     begin = time.perf_counter()
     with watching(out, len(file.tracks), "first reconstruction", not json) as watch:
         first = first_reconstruction(file, tracks, start, backend, init, robust)
+        check_kept(first, segments, "start")
         watch.begin()
         result = adjuster(scheduler)(
             file.tracks,
@@ -264,12 +253,13 @@ def bundle(
             max_iter=max_iter,
             backend=backend,
             callback=watch,
+            **({} if segments is None else {"lines": segments}),
         )
     seconds = time.perf_counter() - begin
 
     if y_up is None:
         y_up = tracks.suffix.lower() not in _Y_DOWN
-    answer = _Answer(result, file, tracks, y_up, seconds)
+    answer = TracksAnswer(result, file, tracks, y_up, seconds, segments)
     targets.save(answer.save)
     targets.draw(answer.draw)
     refused = None if colmap is None else answer.save_colmap(colmap)
@@ -324,114 +314,3 @@ def gauge_named(name: str | None) -> eg.gauge.Gauge | None:
         return None
     gauge: eg.gauge.Gauge = getattr(eg.gauge, as_choice("gauge", name, get_args(GaugeName)))()
     return gauge
-
-
-class _Answer:
-    """A result and the forms it is given in."""
-
-    def __init__(
-        self, result: eg.BundleResult, file: TrackFile, source: Path, y_up: bool, seconds: float
-    ) -> None:
-        self.result, self.file, self.source = result, file, source
-        self.y_up, self.seconds = y_up, seconds
-        self.model: PinholeModel | None = None
-
-    @cached_property
-    def frame(self) -> Display:
-        """Where to look at it."""
-        return display(self.result.reconstruction, self.file.tracks, y_up=self.y_up)
-
-    def more(self) -> dict[str, Any]:
-        """Return what the result does not hold."""
-        return {
-            "source": told(self.source),
-            "n_views": self.file.tracks.n_views,
-            "n_points": self.file.tracks.n_points,
-            "view_numbers": self.file.views,
-            "point_numbers": self.file.points,
-            "seconds": self.seconds,
-        }
-
-    def document(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        document: dict[str, Any] = plain(self.result)
-        document |= document.pop("reconstruction")
-        if self.model is not None:
-            document["colmap_rms_px"] = self.model.rms_px
-        return document | self.more()
-
-    def save(self, path: Path) -> None:
-        """Write the result, with the tracks it belongs to, or a cloud of points and centres."""
-        if path.suffix.lower() == ".npz":
-            save_result(path, self.result, **arrays_of(self.file.tracks), **self.more())
-            return
-        if path.suffix.lower() == ".csv":
-            save_residuals(path, self.result, self.file.tracks, self.file.views, self.file.points)
-            return
-        frame = self.frame
-        note = "points blue, cameras orange; a basis to look at, not a calibration"
-        save_cloud(path, frame.points[frame.shown], frame.centres, note)
-
-    def draw(self, path: Path) -> None:
-        """Draw a picture, or write a page."""
-        result, tracks = self.result, self.file.tracks
-        title = named(self.source)
-        if path.suffix.lower() == ".html":
-            from epigauge.reports import save_viewer
-
-            numbers: dict[str, Any] = {
-                "view_numbers": self.file.views,
-                "point_numbers": self.file.points,
-            }
-            save_viewer(path, result, tracks, title, frame=self.frame, **numbers)
-            return
-        from epigauge.plots import plot_bundle, save_figure
-
-        save_figure(plot_bundle(result, tracks, title, frame=self.frame), path)
-
-    def save_colmap(self, directory: Path) -> ArgumentError | None:
-        """Write a text model, the views called as in the file of tracks, or return why not."""
-        tracks, found = self.file.tracks, self.result.reconstruction
-        assert isinstance(found, eg.Reconstruction)
-        try:
-            self.model = pinhole_model(found, tracks, frame=self.frame)
-        except ArgumentError as error:
-            return error
-        names: Sequence[str] = [f"view{number:04d}" for number in self.file.views.tolist()]
-        if tracks.names is not None and all(name.split() == [name] for name in tracks.names):
-            names = tracks.names
-        save_colmap_model(directory, self.model, tracks, names=names)
-        return None
-
-    def report(self, out: Console, interrupted: bool) -> None:
-        """Tell people on stderr what came out."""
-        result, tracks = self.result, self.file.tracks
-        rows = {
-            "tracks": f"{tracks.n_views} views, {tracks.n_points} points, "
-            f"{len(tracks)} observations",
-            "method": result.method,
-            "rms_px": f"{result.rms_px:.6g} per coordinate",
-            "cost": f"{result.cost:.8g} px^2",
-            "evaluations": f"{result.nfev}, with {result.njev} linearisations",
-            "status": "interrupted" if interrupted else escape(result.message),
-            "seconds": f"{self.seconds:.2f}",
-        }
-        if result.flags:
-            rows["flags"] = ", ".join(result.flags)
-        if result.rejected.any():
-            count = int(np.count_nonzero(result.rejected))
-            rows["set aside"] = f"{count} of {len(tracks)} observations, as gross errors"
-        if result.loss_scale_px:
-            rows["loss_scale_px"] = f"{result.loss_scale_px:.4g}"
-        if self.model is not None:
-            rows["colmap"] = (
-                f"{self.model.rms_px:.6g} px RMS by pinhole cameras, "
-                f"{self.model.projective_rms_px:.6g} px by the projective ones: their skew is "
-                "left out; a start for `colmap bundle_adjuster`, no calibration"
-            )
-        out.print(facts(escape(shown(self.source)), rows))
-        for name, text in explained(result.flags).items():
-            style = "bold yellow" if usable([name], "views") else "bold red"
-            out.print(f"[{style}]{name}:[/] {escape(text)}")
-        if result.status <= 0 and not interrupted:
-            out.print(f"[bold red]did not converge:[/] {escape(result.message)}")

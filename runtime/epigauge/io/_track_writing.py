@@ -52,7 +52,7 @@ def write_csv(file: IO[bytes], tracks: Tracks) -> None:
         raise ArgumentError("tracks", was, "a name ending in .npz")
     arrays = arrays_of(tracks)
     names = None
-    if tracks.names is not None and _are_numbers(tracks.names):
+    if tracks.names is not None and are_numbers(tracks.names):
         names = np.array(tracks.names)
     elif tracks.names is not None:
         names = np.array(labels("names", tracks.names, int(tracks.view[0])))
@@ -79,7 +79,7 @@ def labels(argument: str, names: Sequence[str], first: int) -> list[str]:
     return [_label(argument, name) for name in names]
 
 
-def _are_numbers(names: Sequence[str]) -> bool:
+def are_numbers(names: Sequence[str]) -> bool:
     """Tell whether names are rising whole numbers, which readers take for numbers of views."""
     longest = len(str(MAX_MATCHES)) - 1
     if not all(name.isdecimal() and len(name) <= longest for name in names):

@@ -14,7 +14,7 @@ from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._common import PathLike, check_suffix
 from epigauge.io._npz import read_npz, write_npz
 from epigauge.io._text import Columns, read_text
-from epigauge.io._track_writing import labels
+from epigauge.io._track_writing import are_numbers, labels
 from epigauge.io.output import writing
 from epigauge.multi_view.line_tracks import LineTracks
 from epigauge.multi_view.tracks import Tracks
@@ -42,7 +42,8 @@ def load_line_tracks(path: PathLike, tracks: Tracks | None = None) -> LineTracks
 
     A text file (``.csv``) has a line ``view,line,x1,y1,x2,y2`` each, or a first line with the names
     of the columns: these in any order, optionally ``sigma``, the standard deviation of the end
-    points' coordinates in pixels. Lines and, with `tracks`, views are numbers from 0 or names.
+    points' coordinates in pixels. Lines and, with `tracks`, views are numbers from 0 or names; of
+    tracks whose file has gaps in its numbers of views, the numbers there.
     ``.npz`` holds arrays ``view``, ``line``, ``segments`` (N, 4), optionally ``spread`` (N, 6): the
     covariances xx, xy, yy of both end points; further ones are not looked at.
 
@@ -82,8 +83,11 @@ def load_line_tracks(path: PathLike, tracks: Tracks | None = None) -> LineTracks
         rows: list[int] = []
         found = read_text(path, file, _COLUMNS, rows=rows)
     view, names = found["view"], found.get("line_names")
+    numbered = tracks is not None and tracks.names is not None and are_numbers(tracks.names)
     if "view_names" in found:
         view = _named(path, found["view_names"], tracks, view, rows)
+    elif numbered:  # numbers of the file that the tracks are of
+        view = _named(path, [*map(str, range(view.max() + 1))], tracks, view, rows)
     elif tracks is not None and view.max() >= tracks.n_views:
         first = int(np.argmax(view >= tracks.n_views))
         reason = f"view is {view[first]}, needed: 0 to {tracks.n_views - 1}"
@@ -141,7 +145,7 @@ def save_line_tracks(path: PathLike, lines: LineTracks, tracks: Tracks | None = 
         was = f"have {len(view_names)} views, and lines name view {lines.view.max()}"
         raise ArgumentError("tracks", was, "those of the same views")
     columns: list[Sequence[Any]] = [
-        _fields("tracks", view_names, lines.view.tolist()),
+        _fields("tracks", view_names, lines.view.tolist(), numbers=True),
         _fields("lines", lines.names, lines.line.tolist()),
         *lines.segments.T.tolist(),
         sigma.tolist(),
@@ -167,12 +171,14 @@ def _written(value: object) -> str:
     return f"{value:.17g}" if isinstance(value, float) else str(value)
 
 
-def _fields(argument: str, names: Sequence[str] | None, numbers: list[int]) -> Sequence[Any]:
-    """Return a column of names, or of numbers where there are none."""
+def _fields(
+    argument: str, names: Sequence[str] | None, rows: list[int], numbers: bool = False
+) -> Sequence[Any]:
+    """Return a column of names, or of numbers where there are none; `numbers` may be names."""
     if names is None:
-        return numbers
-    found = labels(argument, names, numbers[0])
-    return [found[k] for k in numbers]
+        return rows
+    known = names if numbers and are_numbers(names) else labels(argument, names, rows[0])
+    return [known[k] for k in rows]
 
 
 def _of_arrays(path: Path, file: IO[bytes]) -> LineTracks:

@@ -72,14 +72,16 @@ class Display:
     y_up: bool
 
     def placed(self, X: Array) -> Array:
-        """Return where points (k, 3) of the reconstruction are shown, (k, 3)."""
-        Q = np.linalg.solve(self.T, np.concatenate([X, np.ones((len(X), 1))], axis=1).T).T
+        """Return where points (k, 3), or homogeneous ones (k, 4), are shown, (k, 3)."""
+        if X.shape[1] == 3:
+            X = np.concatenate([X, np.ones((len(X), 1))], axis=1)
+        Q = np.linalg.solve(self.T, X.T).T
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(Q[:, :3] / Q[:, 3:])
 
     def placed_pieces(self, pieces: Array) -> Array:
-        """Return where pieces of lines (L, 2, 3) are shown, without those that go far away."""
-        ends = self.placed(pieces.reshape(-1, 3)).reshape(-1, 2, 3)
+        """Return where pieces of lines are shown, (l, 2, 3), without those that go far away."""
+        ends = self.placed(pieces.reshape(-1, pieces.shape[-1])).reshape(-1, 2, 3)
         return ends[(np.abs(ends) < FAR_POINT).all(axis=(1, 2))]
 
     @property

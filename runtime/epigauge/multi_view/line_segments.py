@@ -8,18 +8,17 @@ import numpy as np
 from epigauge_generated.signatures import SIGNATURES
 from numpy.typing import NDArray
 
+from epigauge import kernels
 from epigauge.bundle.lines import Segments
 from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.line_tracks import LineTracks
+from epigauge.multi_view.reconstruction import Reconstruction
 
 __all__ = ["checked_lines", "frame_of", "line_pieces", "projective_segments", "segments_of"]
 
 Array = NDArray[np.float64]
-
-#: A line of sight along the line meets it nowhere in particular.
-_PARALLEL = 1e-6
 
 
 def checked_lines(lines: Any, n_views: int) -> LineTracks:
@@ -101,39 +100,54 @@ def _whole(array: Array) -> Array:
     return np.ascontiguousarray(array)
 
 
-def line_pieces(lines: LineTracks, reconstruction: MetricReconstruction) -> Array:
-    """Return the ends of the piece of each line that its segments show, (L, 2, 3).
+def line_pieces(lines: LineTracks, reconstruction: MetricReconstruction | Reconstruction) -> Array:
+    """Return the ends of the piece of each line that its segments show, (L, 2, 3) or (L, 2, 4).
 
-    From each end point's line of sight the nearest place on the line is taken; of the places of all
-    views the middle half of the views decides where the piece begins and ends.
+    An end point stands for the place of the line whose image is nearest to it. In the view with the
+    longest segment of a line, the middle half of the places of all views decides where the piece
+    begins and ends: images decide, so that no basis has a part in it. In a projective basis places
+    are homogeneous, as its points are.
     """
-    if not isinstance(reconstruction, MetricReconstruction):
-        was = f"is a {type(reconstruction).__name__}, in which pieces have no place"
-        raise ArgumentError("reconstruction", was, "an eg.MetricReconstruction: eg.metric_upgrade")
-    segments = segments_of(lines, reconstruction)
+    if not isinstance(reconstruction, MetricReconstruction | Reconstruction):
+        was = f"is a {type(reconstruction).__name__}"
+        raise ArgumentError("reconstruction", was, "a metric or projective one, with lines")
+    checked_lines(lines, len(reconstruction.P))
+    ends = lines.segments.T
+    if isinstance(reconstruction, MetricReconstruction):
+        ends = segments_of(lines, reconstruction).ends
     if reconstruction.lines is None or len(reconstruction.lines) != lines.n_lines:
         count = 0 if reconstruction.lines is None else len(reconstruction.lines)
         raise ArgumentError("reconstruction", f"has {count} lines", f"{lines.n_lines}")
-    K = reconstruction._calibrations()[segments.view]
-    R, centres = reconstruction.R[segments.view], reconstruction.centres[segments.view]
-    n, v = reconstruction.lines[segments.line, :3], reconstruction.lines[segments.line, 3:]
-    # The place of the line that is nearest to each centre, as seen from there.
-    foot = np.cross(v, n - np.cross(centres, v))
+    P, L = reconstruction.P[lines.view], reconstruction.lines[lines.line]
+    along = kernels.table("numpy").line_project(P.transpose(1, 2, 0), L.T)[1::-1].T * [1.0, -1.0]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    first = np.searchsorted(lines.line, np.arange(lines.n_lines + 1))
+    spans = np.sum((ends[2:] - ends[:2]) ** 2, axis=0)
+    longest = np.array([a + np.argmax(spans[a:b]) for a, b in zip(first, first[1:], strict=False)])
+    there, axis = P[longest[lines.line]], along[longest[lines.line]]
     places = np.empty((2, len(lines)))
-    for k in (0, 1):
-        xy = np.concatenate([segments.ends[2 * k : 2 * k + 2].T, np.ones((len(lines), 1))], axis=1)
-        d = np.einsum("nji,nj->ni", R, np.linalg.solve(K, xy[:, :, None])[:, :, 0])
-        d /= np.linalg.norm(d, axis=1, keepdims=True)
-        along = np.sum(d * v, axis=1)
-        across = np.maximum(1.0 - along**2, _PARALLEL)
-        places[k] = along * np.sum(d * foot, axis=1) / across
-    # From the foot of each centre to one origin of the line.
-    first = np.searchsorted(segments.line, np.arange(lines.n_lines + 1))
-    origin = np.cross(v, n)
-    places += np.sum((centres + foot - origin) * v, axis=1)
+    with np.errstate(all="ignore"):
+        for k in (0, 1):
+            s = np.sum(along * ends[2 * k : 2 * k + 2].T, axis=1)
+            h = np.einsum("nij,nj->ni", there, _places(P, L, along, s))
+            seen = np.sum(axis * h[:, :2], axis=1) / h[:, 2]
+            places[k] = np.where(np.isfinite(seen), seen, np.nan)
     low, high = np.sort(places, axis=0)
-    found = np.empty((lines.n_lines, 2, 3))
-    for j, (begin, end) in enumerate(zip(first[:-1], first[1:], strict=True)):
-        s = np.quantile(low[begin:end], 0.25), np.quantile(high[begin:end], 0.75)
-        found[j] = origin[begin] + np.multiply.outer(s, v[begin])
-    return found
+    found = np.empty((lines.n_lines, 2, 4))
+    at = P[longest], reconstruction.lines, along[longest]
+    for k, (side, share) in enumerate(((low, 0.25), (high, 0.75))):
+        s = [np.nanquantile(side[a:b], share) for a, b in zip(first, first[1:], strict=False)]
+        found[:, k] = _places(*at, np.array(s))
+    if isinstance(reconstruction, MetricReconstruction):
+        return np.asarray(found[..., :3] / found[..., 3:])
+    return np.asarray(found / np.linalg.norm(found, axis=2, keepdims=True))
+
+
+def _places(P: Array, L: Array, along: Array, s: Array) -> Array:
+    """Return where the planes of the lines u . (x, y) = s of images meet lines, (N, 4).
+
+    The plane (a, b) and the line (n, v) meet in (a x n - b v, a . v).
+    """
+    plane = np.einsum("nij,ni->nj", P, np.column_stack([along, -s]))
+    a, b, n, v = plane[:, :3], plane[:, 3:], L[:, :3], L[:, 3:]
+    return np.column_stack([np.cross(a, n) - b * v, np.sum(a * v, axis=1)])

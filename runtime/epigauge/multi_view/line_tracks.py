@@ -15,6 +15,7 @@ from epigauge.multi_view.labels import view_names
 
 if TYPE_CHECKING:
     from epigauge.cameras import MetricReconstruction
+    from epigauge.multi_view.reconstruction import Reconstruction
 
 __all__ = ["LineTracks"]
 
@@ -123,18 +124,19 @@ class LineTracks(Result):
         for array in (self.order, self.view, self.line, self.segments, self.spread):
             array.setflags(write=False)
 
-    def pieces(self, reconstruction: MetricReconstruction) -> Array:
+    def pieces(self, reconstruction: MetricReconstruction | Reconstruction) -> Array:
         """Return what the segments show of each line, to be drawn.
 
         Parameters
         ----------
-        reconstruction : MetricReconstruction
+        reconstruction : MetricReconstruction or Reconstruction
             Cameras and lines.
 
         Returns
         -------
-        ndarray, shape (L, 2, 3)
-            Ends of a piece of each line: a quarter of the views sees more at either end.
+        ndarray, shape (L, 2, 3) or (L, 2, 4)
+            Ends of a piece of each line: a quarter of the views sees more at either end. In a
+            projective basis homogeneous, of length one.
 
         Raises
         ------

@@ -54,7 +54,7 @@ def plot_bundle(
         What to call them.
     frame : Display, optional
         Where to show them; by default ``display(result.reconstruction, tracks)``.
-    pieces : array_like, shape (L, 2, 3), optional
+    pieces : array_like, shape (L, 2, 3) or (L, 2, 4), optional
         Ends of pieces of lines, to be drawn, too: `LineTracks.pieces`.
 
     Returns

@@ -74,8 +74,8 @@ def save_viewer(
     pictures : sequence of bytes
         JPEG file of each view, small ones, to be shown where the camera is; the whole image, and
         tracks that know the sizes of theirs.
-    pieces : array_like, shape (L, 2, 3), optional
-        Ends of pieces of lines in the scene, to be drawn, too.
+    pieces : array_like, shape (L, 2, 3) or (L, 2, 4), optional
+        Ends of pieces of lines in the scene, to be drawn, too: `LineTracks.pieces`.
 
     Raises
     ------
