@@ -15,7 +15,8 @@ from epigauge_derive.kernel import kernels
 from epigauge_derive.program import compile_kernel
 
 _DEFAULT = Path(__file__).resolve().parents[2] / "generated"
-_NOT_OURS = ("__pycache__",)
+#: What Python, and a library compiled in place, leave there.
+_NOT_OURS, _COMPILED = ("__pycache__",), (".so", ".dylib", ".dll")
 
 
 def generate() -> dict[str, str]:
@@ -35,7 +36,9 @@ def existing(root: Path) -> set[str]:
     return {
         path.relative_to(root).as_posix()
         for path in root.rglob("*")
-        if path.is_file() and not any(part in _NOT_OURS for part in path.parts)
+        if path.is_file()
+        and path.suffix not in _COMPILED
+        and not any(part in _NOT_OURS for part in path.parts)
     }
 
 

@@ -95,6 +95,11 @@ def test_check_shows_a_changed_byte_as_a_unified_diff(copy, capsys, name):
     assert f"\n+{lines[number]}" in printed
 
 
+def test_check_leaves_compiled_libraries_alone(copy):
+    (copy / "epigauge_generated/c_backend/libkernels.so").write_bytes(b"\x7fELF")
+    assert check(copy) == 0
+
+
 def test_check_sees_other_line_ends(copy, capsys):
     path = copy / "c/digest.c"
     path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
