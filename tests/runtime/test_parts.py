@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from collections.abc import Iterator
@@ -247,6 +248,41 @@ def test_a_damaged_part_is_named(damage: Any, folder: Path) -> None:
         read(folder)
 
 
+def test_parts_made_elsewhere_are_checked_as_tracks_are(folder: Path) -> None:
+    part = Parts.open(folder).parts[3]
+    path, own = Path(part.path), ("view", "point", "xy", "weights")
+    with np.load(path) as file:
+        given = dict(file)
+    own = tuple(name for name in (*own, "whitening") if name in given)
+
+    def written(**rows: Any) -> Any:
+        """Return the part with other rows, as the manifest would list it."""
+        np.savez(path, **(given | rows))
+        count = len(rows["view"]) if "view" in rows else part.n_observations
+        return dataclasses.replace(part, n_observations=count)
+
+    def chosen(rows: Any) -> dict[str, Any]:
+        return {name: given[name][rows] for name in own}
+
+    expected, every = part.load(), np.arange(part.n_observations)
+    # Views in any order within a point, other widths and ends of numbers.
+    turned = np.lexsort((-given["view"], given["point"]))
+    found = written(**chosen(turned)).load()
+    back = np.lexsort((found.view, found.point))
+    np.testing.assert_array_equal(found.q[:, back], expected.q)
+    found = written(view=given["view"].astype(">i2"), xy=given["xy"].astype(">f8")).load()
+    np.testing.assert_array_equal(found.view, expected.view)
+    np.testing.assert_array_equal(found.q, expected.q)
+    twice = written(**chosen(np.insert(every, 1, 0)))
+    with pytest.raises(FileFormatError, match=r"has view \d+, point 0 twice"):
+        twice.load()
+    once = written(**chosen(every[(given["point"] > 0) | (every == 0)]))
+    with pytest.raises(FileFormatError, match="point 0 has fewer than 2 observations"):
+        once.load()
+    with pytest.raises(FileFormatError, match=r"view has type float64.*needed: whole numbers"):
+        written(view=given["view"].astype(float)).load()
+
+
 def test_a_part_of_another_scene_is_named(folder: Path, scene: Scene, tmp_path: Path) -> None:
     tracks, start = scene
     other = eg.distributed.write_parts(tracks, tmp_path / "other", start)
@@ -268,7 +304,9 @@ def test_a_part_of_another_scene_is_named(folder: Path, scene: Scene, tmp_path: 
         (lambda told: told["parts"].pop(), "n_points is 90, its parts have"),
         (lambda told: told["parts"][0].update(file="../x.npz"), "is not in the folder"),
         (lambda told: told.update(names=["a"]), "1 names of 12 views"),
+        (lambda told: told.update(names="a" * 12), "names that are no list"),
         (lambda told: told.update(scale_px=float("nan")), "not positive"),
+        (lambda told: told.update(scale_px=1e300), "too large"),
         (lambda told: told.update(n_views=13), "cameras.npz: has 12 views"),
         (lambda told: told.update(n_points=float("inf")), "is damaged: OverflowError"),
         (lambda told: told["parts"][0].pop("bytes"), "is damaged: KeyError"),

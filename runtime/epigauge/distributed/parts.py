@@ -21,6 +21,7 @@ from epigauge.distributed.part_files import STORAGES, read_part
 from epigauge.errors import EpigaugeError, FileFormatError
 from epigauge.io._common import PathLike, cut
 from epigauge.io._npz import read_npz
+from epigauge.multi_view.tracks import MIN_VIEWS
 
 __all__ = ["CAMERAS", "FORM", "MANIFEST", "Part", "PartArrays", "Parts", "is_parts"]
 
@@ -106,8 +107,19 @@ class Part:
             if len(bad):
                 reason = f"{name} is {index[bad[0]]} in row {bad[0]}, needed: 0 to {limit - 1}"
                 raise self.fault(reason)
-        if not (np.diff(point) >= 0).all() or len(np.unique(point)) != self.n_points:
+        seen = np.bincount(point, minlength=self.n_points)
+        if not ((np.diff(point) >= 0).all() and seen.all()):
             raise self.fault("array point does not rise from 0 without gaps")
+        if seen.min() < MIN_VIEWS:
+            few = f"point {int(np.argmin(seen))} has fewer than {MIN_VIEWS} observations"
+            raise self.fault(f"{few}; needed: all those of a point in its part")
+        both = point * self.n_views + view
+        if not (np.diff(both) > 0).all():  # in any order within a point, but once
+            both = np.sort(both)
+            again = np.flatnonzero(np.diff(both) == 0)
+            if len(again):
+                k, i = divmod(int(both[again[0]]), self.n_views)
+                raise self.fault(f"has view {i}, point {k} twice; needed: one observation")
         for name, array, most in (("xy", xy, MAX_PX), ("weights", weights, MAX_WEIGHT)):
             if not (np.abs(array) <= most).all():
                 raise self.fault(f"array {name} has numbers that are not finite or too large")
@@ -146,7 +158,8 @@ class Part:
             array = found[name]
             if array.dtype.kind not in kinds or array.shape != shape:
                 was = f"array {name} has type {array.dtype}, shape {array.shape}"
-                raise self.fault(f"does not fit the manifest: {was}; needed: {shape}")
+                kind = {"f": "numbers", "u": "bytes"}.get(kinds, "whole numbers")
+                raise self.fault(f"does not fit the manifest: {was}; needed: {kind} {shape}")
             if kinds == "f":
                 found[name] = np.ascontiguousarray(array, np.float64)
         if not np.isfinite(found["X"]).all():
@@ -295,10 +308,13 @@ def _parts(folder: Path, found: dict[str, Any]) -> tuple[Parts, list[int]]:
         sizes.append(size)
         parts.append(Part(str(folder / name), scene, n, points, seen, whitened))
     unit, heaviest, scale = (float(found[name]) for name in ("unit", "heaviest", "scale_px"))
-    if not parts or min(n, m, N) < 1 or not all(0.0 < x < np.inf for x in (unit, heaviest, scale)):
-        raise ValueError("numbers that are not positive")
+    limits = (unit, MAX_PX), (heaviest, MAX_WEIGHT), (scale, MAX_PX)
+    if not parts or min(n, m, N) < 1 or not all(0.0 < x <= most for x, most in limits):
+        raise ValueError("numbers that are not positive, or too large")
     names = found["names"]
     if names is not None:
+        if not isinstance(names, list):
+            raise TypeError("names that are no list")
         names = tuple(map(str, names))
         if len(names) != n:
             raise ValueError(f"{len(names)} names of {n} views")
