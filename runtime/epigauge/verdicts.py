@@ -62,10 +62,10 @@ FLAGS = {
         ("F", "E", "views"),
     ),
     "planar scene": Flag(
-        "one homography explains the matches within the noise: a planar scene, or a camera that "
-        "only turned; the matches do not determine F",
-        "match points off the plane too, or use the homography; with K known, essential=True "
-        "leaves at most two motions",
+        "one plane explains what was matched within the noise, or a camera that only turned: the "
+        "points do not determine the cameras (of two uncalibrated views, F)",
+        "match points off the plane too; of two views, use the homography, or with K known "
+        "essential=True, which leaves at most two motions",
         ("F", "views"),
     ),
     "nearly planar": Flag(

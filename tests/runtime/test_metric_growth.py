@@ -103,4 +103,4 @@ def test_searches_take_a_scene_that_grew_only_where_it_is_better() -> None:
     search = Search(sampled(tracks), images, "SIMPLE_RADIAL", 1, None)
     fit = search.run(None)
     assert fit is not None
-    assert search._better(fit).typical <= fit.typical
+    assert search._grown(fit).typical <= fit.typical

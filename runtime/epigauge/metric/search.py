@@ -16,6 +16,7 @@ from epigauge.metric.growth import grown
 from epigauge.metric.quadric import Basis, Views, metric_bases
 from epigauge.metric.samples import Sample
 from epigauge.metric.scene import Images, metric_scene
+from epigauge.metric.turning import turned
 from epigauge.multi_view.adjust import BundleResult, bundle_adjust
 from epigauge.multi_view.initialize import initialize
 from epigauge.multi_view.reconstruction import Reconstruction
@@ -108,6 +109,13 @@ def metric_of(bundle: BundleResult) -> MetricReconstruction:
     return found
 
 
+def _better(one: Fit | None, other: Fit | None) -> Fit | None:
+    """Return the scene that most observations are nearer to; the first, if there is no other."""
+    if one is None or other is None:
+        return other if one is None else one
+    return other if other.typical < one.typical else one
+
+
 class Search:
     """A sample of tracks, and what is asked of it.
 
@@ -147,9 +155,12 @@ class Search:
         """Return the best metric scene, from a projective reconstruction or without.
 
         Without, a plain start is tried first, a robust one where that leads nowhere good, and then
-        calibrated cameras in turn, from guesses of the focal length.
+        calibrated cameras in turn, from guesses of the focal length. Where cameras in one place are
+        near what the views see, those near them are tried, too.
         """
         best: Fit | None = None
+        parts = self.sample.tracks, self.images, self.camera, self.priors, self.options
+        one_place = turned(*parts)
         for robust in (False, True):
             try:
                 projective = self._projective(given, robust)
@@ -157,46 +168,55 @@ class Search:
                 if hopeless:
                     self.flags = tuple(f for f in projective.flags if f in hopeless)
                     return None
-                fit = self._metric(projective)
+                best = _better(best, self._metric(projective))
             except (ArgumentError, np.linalg.LinAlgError):
-                fit = None
-            if fit is not None and (best is None or fit.typical < best.typical):
-                best = fit
+                pass
+            if one_place is not None and not robust:
+                best = _better(best, self._from(one_place.moving))
+                left = None if best is None else self._left(best.reconstruction)
+                if left is None or one_place.explains_as_well(left):
+                    self.flags = ("pure rotation",)
+                    return None
             if given is not None or (best is not None and not self._doubted(best)):
                 return best
-        return self._better(best)
+        return self._grown(best)
 
-    def _better(self, best: Fit | None) -> Fit | None:
+    def _grown(self, best: Fit | None) -> Fit | None:
         """Return the best of a doubted scene and those that grow from guessed focal lengths."""
         tracks, unit = self.sample.tracks, self.images.unit
         for share in _GUESSES:
             try:
                 scene = grown(tracks, self.images, self.camera, share * unit, self.options)
-                fit = None if scene is None else self._of_grown(scene, share)
             except (ArgumentError, np.linalg.LinAlgError):
                 continue
-            if fit is not None and (best is None or fit.typical < best.typical):
+            fit = None if scene is None else self._from(scene)
+            if _better(best, fit) is not best:
                 best = fit
-                if not self._doubted(best):
+                if best is not None and not self._doubted(best):
                     break
         return best
 
-    def _of_grown(self, scene: MetricReconstruction, share: float) -> Fit:
-        """Return a scene that grew, adjusted, beside the projective one next to it."""
+    def _from(self, scene: MetricReconstruction) -> Fit | None:
+        """Return a scene of calibrated cameras, adjusted, beside the projective one next to it."""
         tracks, options = self.sample.tracks, self.options
-        adjusted = self._adjusted(scene, self._first())
-        projective = bundle_adjust(
-            tracks, adjusted.to_projective(), loss="cauchy", ftol=1e-4, **options
-        )
+        try:
+            adjusted = self._adjusted(scene, self._first())
+            projective = bundle_adjust(
+                tracks, adjusted.to_projective(), loss="cauchy", ftol=1e-4, **options
+            )
+            best, refined = self._freed(adjusted)
+        except (ArgumentError, np.linalg.LinAlgError):
+            return None
         ahead = float(np.mean(adjusted.depths(tracks)[tracks.weights > 0.0] > 0.0))
         cost = self._cost(adjusted, projective.loss_scale_px)
-        guess = Basis(np.eye(4), share, float("nan"), cost)
-        best, refined = self._freed(adjusted)
+        places = list(camera_model(self.camera).focal)
+        share = scene.cameras.of_views[:, places].mean(axis=1) / self.images.unit
+        begun = Basis(np.eye(4), float(np.median(share)), float("nan"), cost)
         return Fit(
             best,
             refined,
-            (self._candidate(guess, ahead, adjusted, cost),),
-            median(np.linalg.norm(tracks.xy - best.project(tracks), axis=1)),
+            (self._candidate(begun, ahead, adjusted, cost),),
+            median(np.linalg.norm(self._left(best), axis=1)),
             median(np.linalg.norm(projective.fun, axis=1)),
             ahead,
         )
@@ -215,7 +235,9 @@ class Search:
     def _projective(self, given: Reconstruction | None, robust: bool) -> BundleResult:
         """Return a projective reconstruction of the sample, robustly adjusted."""
         if given is None:
-            start = initialize(self.sample.tracks, robust=robust, backend=self.options["backend"])
+            # Where cameras do not register, growing calibrated ones is faster than factoring.
+            options: Any = {"method": "registration", "robust": robust, "backend": self.backend}
+            start = initialize(self.sample.tracks, **options)
         else:
             start = Reconstruction(given.P, given.Q[self.sample.points])
         options = self.options
@@ -249,7 +271,7 @@ class Search:
             best,
             refined,
             tuple(entry[1] for entry in tried),
-            median(np.linalg.norm(tracks.xy - best.project(tracks), axis=1)),
+            median(np.linalg.norm(self._left(best), axis=1)),
             typical,
             tried[0][1].ahead,
         )
@@ -268,6 +290,10 @@ class Search:
             **self.options,
         )
         return metric_of(found)
+
+    def _left(self, scene: MetricReconstruction) -> Array:
+        """Return what a scene leaves of the observations of the sample, in pixels."""
+        return self.sample.tracks.xy - scene.project(self.sample.tracks)
 
     def _of(self, names: tuple[str, ...]) -> tuple[IntrinsicPrior, ...] | None:
         """Return what is known of intrinsics that are refined."""
