@@ -78,6 +78,9 @@ def test_a_bal_file_is_a_scene_with_refine_and_tracks_without(run, tmp_path) -> 
     assert eg.load_scene(tmp_path / "o.txt.gz")[1].rms_px(tracks) < start.rms_px(tracks)
     code, out, _ = run("bundle", path)
     assert (code, len(out.split())) == (0, 4 * 12)
+    code, _, told = run("bundle", path, "-o", tmp_path / "o.txt.gz")
+    assert code == 2
+    assert "or --refine" in told
 
 
 def test_a_bal_file_becomes_a_folder_with_the_size_of_its_images(run, tmp_path) -> None:

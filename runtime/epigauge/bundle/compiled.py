@@ -71,7 +71,7 @@ def minimized(
     cameras = own.layout.inward(start.cameras).copy()
     # In the order of the passes points are found faster.
     order, lanes = own.layout.points, own.layout.lane_by_lane
-    points, bundle = start.points[order], own.layout.bundle(own.loss)
+    points, bundle = start.points.take(order, axis=0), own.layout.bundle(own.loss)
     bundle.point = address(lanes)
     focal = np.array([12 + k for k in problem.model.focal], np.int32)
     stop = ctypes.c_int(0)

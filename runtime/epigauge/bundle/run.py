@@ -99,7 +99,7 @@ def bundle_problem(
         linearizer_for(model, kernels, *measured, workers, ties, whitening, seen),
         lambda cameras, own: np.ascontiguousarray(retract(cameras.T, own.T).T),
         refinement=how if embedded else None,
-        floor=0.5 * float(np.sum(weights * (_ROUNDING * q) ** 2)),
+        floor=0.5 * _ROUNDING**2 * float(np.vdot(weights * q, q)),
         **parts,
     )
 

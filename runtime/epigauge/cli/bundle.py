@@ -232,7 +232,13 @@ def bundle(
     if lines is not None and colmap is not None:
         was = "is given with lines, for which it has no place"
         raise ArgumentError("--colmap", was, "-o NAME.npz")
-    targets = Targets(plot, output, (".npz", ".ply", ".csv"), json=json)
+    try:
+        targets = Targets(plot, output, (".npz", ".ply", ".csv"), json=json)
+    except ArgumentError as error:
+        if tracks.suffix.lower() in _Y_DOWN:
+            raise
+        needed = f"{error.needed}; or --refine, which adjusts the cameras of a BAL file as a scene"
+        raise ArgumentError(error.argument, error.was, needed) from None
     out = console()
     file = load_track_file(tracks, clean, prune=repeated if prune else None)
     segments = None if lines is None else segments_of_file(lines, file)

@@ -47,7 +47,7 @@ class Frame:
             counts = np.bincount(view, minlength=n)
             sums = [np.bincount(view, xy[:, k]) / counts for k in (0, 1)]
             origins = np.stack(sums, axis=1)
-            centred = xy - origins[view]
+            centred = xy - origins.take(view, axis=0)
             scale = float(np.sqrt(np.vdot(centred, centred) / centred.size))
         if not scale > 0.0:
             raise ArgumentError("tracks", "have all points of a view at one place", "other points")
@@ -59,7 +59,7 @@ class Frame:
 
     def points_in(self, xy: Array, view: Indices) -> Array:
         """Return conditioned image points, shape (2, N), from pixels (N, 2)."""
-        return np.ascontiguousarray(((xy - self.origins[view]) / self.scale).T)
+        return np.ascontiguousarray(((xy - self.origins.take(view, axis=0)) / self.scale).T)
 
     def cameras_in(self, P: Array) -> Array:
         """Return cameras to conditioned coordinates from cameras to pixels."""

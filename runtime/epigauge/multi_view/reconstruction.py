@@ -185,7 +185,8 @@ class Reconstruction(ReconstructionBase):
         (80, 2)
         """
         self.check_fits(tracks)
-        h = np.einsum("nij,nj->ni", self.P[tracks.view], self.Q[tracks.point])
+        P, Q = self.P.take(tracks.view, axis=0), self.Q.take(tracks.point, axis=0)
+        h = np.einsum("nij,nj->ni", P, Q)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             return np.asarray(h[:, :2] / h[:, 2:])
 
