@@ -290,6 +290,18 @@ def test_perspective_that_does_not_show_is_told_of_projective_cameras() -> None:
         assert ("near-affine" in found.flags) is expected
 
 
+@pytest.mark.parametrize("plane", [False, True])
+def test_a_point_that_went_far_away_neither_hides_nor_makes_a_plane(plane: bool) -> None:
+    # As a point whose observations were set aside: they have no weight.
+    tracks, scene = seen_from(ring(), flat(1) if plane else cloud(1), 1)
+    X = scene.X.copy()
+    X[0] = [2e9, 1e9, 1e8]
+    far = eg.MetricReconstruction(scene.R, scene.t, X, scene.cameras)
+    kept = tracks.weighted(np.where(tracks.point == 0, 0.0, 1.0))
+    found = eg.bundle_adjust(kept, far, refine=("f",))
+    assert ("flat scene" in found.flags) is plane
+
+
 def test_networks_fall_into_parts() -> None:
     view, point = np.array([0, 1, 1, 2, 3, 4]), np.array([0, 0, 1, 1, 2, 2])
     (part,) = loose_parts(view, point, 5)
