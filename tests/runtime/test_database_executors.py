@@ -86,6 +86,18 @@ with ThreadPoolExecutor(2) as executor:
 
 
 @pytest.mark.slow
+def test_the_command_line_computes_by_a_scheduler(many: Path, client: Any, run: Any) -> None:
+    pytest.importorskip("typer", reason="the command line needs typer")
+    there = "--scheduler", client.scheduler.address
+    for options in ([], ["--from-matches"]):
+        here = run("colmap", many, *options)
+        assert run("colmap", many, *options, *there)[:2] == here[:2]
+    code, _, told = run("colmap", many, *there, "--workers", "2")
+    assert code == 2
+    assert "--workers is given beside --scheduler" in told
+
+
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
 def test_killed_while_it_writes_what_executors_found_the_database_is_whole(
     tmp_path: Path, expected: Any

@@ -11,7 +11,7 @@ from typing import Any
 import epigauge as eg
 from epigauge.errors import ArgumentError, MissingPackageError
 
-__all__ = ["adjuster", "client_of", "local_client"]
+__all__ = ["adjuster", "client_of", "local_client", "pool"]
 
 #: Seconds within which a scheduler answers.
 _ANSWERS = 10
@@ -41,6 +41,18 @@ def client_of(scheduler: str) -> Any:
         was = f"{scheduler!r:.80} does not answer ({error!s:.200})"
         needed = "the address of a running scheduler, such as tcp://host:8786"
         raise ArgumentError("--scheduler", was, needed) from None
+
+
+@contextmanager
+def pool(workers: int, scheduler: str | None) -> Iterator[dict[str, Any]]:
+    """Give where pairs are computed, as the library takes it: here, or by a scheduler's workers."""
+    if scheduler is None:
+        yield {"workers": workers}
+        return
+    if workers != 1:
+        raise ArgumentError("--workers", "is given beside --scheduler", "one of them")
+    with client_of(scheduler) as client:
+        yield {"executor": client.get_executor()}
 
 
 @contextmanager

@@ -27,7 +27,7 @@ def verify(
     database: Path,
     write: bool,
     backup: bool,
-    workers: int,
+    where: dict[str, Any],
     backend: Backend | None,
     targets: Targets,
     json: bool,
@@ -40,9 +40,9 @@ def verify(
             database,
             write=write,
             backup=backup,
-            workers=workers,
             backend=backend,
             progress=callback,
+            **where,
         )
     seconds = time.perf_counter() - begin
     rows = [_row(result, k) for k in range(len(result))]

@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from epigauge._options import Backend, Loss
+from epigauge.cli._cluster import pool
 from epigauge.cli._common import (
     BAD_INPUT,
     DONE,
@@ -55,6 +56,14 @@ def colmap(
             help="Verify the raw matches; with --write, store what each pair is.",
         ),
     ] = False,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Compute by the workers of a Dask cluster, such as tcp://host:8786.",
+            show_default=False,
+        ),
+    ] = None,
     output: Annotated[list[Path] | None, outputs("Save all pairs: CSV, or NPZ with more.")] = None,
     json: Json = False,
 ) -> int:
@@ -77,19 +86,20 @@ def colmap(
     if from_matches:
         if loss != "linear" or max_iter != _MAX_ITER:
             raise ArgumentError("--from-matches", "takes no --loss or --max-iter", "it alone")
-        return verify(database, write, backup, workers, backend, targets, json)
+        with pool(workers, scheduler) as where:
+            return verify(database, write, backup, where, backend, targets, json)
     out = console()
     begin = time.perf_counter()
-    with progress(out, not json) as callback:
+    with pool(workers, scheduler) as where, progress(out, not json) as callback:
         result = refine_database(
             database,
             write=write,
             backup=backup,
-            workers=workers,
             progress=callback,
             loss=loss,
             max_iter=max_iter,
             backend=backend,
+            **where,
         )
     seconds = time.perf_counter() - begin
     rows = [_row(result, k) for k in range(len(result))]
