@@ -7,7 +7,9 @@
 A street: views along a curve, each point seen by eight neighbours, cameras of the model `bal` with
 parameters of their own. First, without `--parts`: the milliseconds of a step in this process (one
 thread), by one worker and by two, best of several rounds in turns; what a step takes of processor
-time, in this process and in the busiest worker; and by how much cost and points differ. With
+time in this process; how long the busiest worker computes in it, and how long it waits for others,
+transport and this process; and by how much cost and points differ, the latter after a similarity,
+and of a few observations also in their standard deviations. With
 `--ceiling`: what two processes can be at most on this machine. A process adjusts half of the views
 on its own, and beside another one that does the same: they share memory and caches, and no work.
 With `--parts`: observations are generated part by part, written to a folder and adjusted from there
@@ -32,12 +34,16 @@ from typing import Any
 import epigauge as eg
 import numpy as np
 from _measure import described, machine, markdown
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, get_task_stream
+from lines import aligned
 
 #: Views that see a point, and observations of a part.
 _SEEN, _PART = 8, 250_000
 
-FOCAL = 900.0
+#: Observations up to which standard deviations are computed.
+_SURE = 1_000_000
+
+FOCAL, NOISE_PX = 900.0, 0.5
 
 
 def cameras(views: int, seed: int = 0) -> eg.MetricReconstruction:
@@ -73,7 +79,9 @@ def chunks(true: eg.MetricReconstruction, observations: int) -> Iterator[eg.dist
         point = np.repeat(np.arange(end - begin), _SEEN)
         view = (first[:, None] + np.arange(_SEEN)).ravel()
         scene = eg.MetricReconstruction(true.R, true.t, X, true.cameras)
-        xy = scene.project(_Seen(view, point, views, len(X))) + rng.normal(0.0, 0.5, (len(view), 2))
+        xy = scene.project(_Seen(view, point, views, len(X))) + rng.normal(
+            0.0, NOISE_PX, (len(view), 2)
+        )
         yield eg.distributed.Chunk(X + rng.normal(0.0, 0.02, X.shape), view, point, xy)
 
 
@@ -116,9 +124,20 @@ def a_step(result: Any) -> float:
     return float(rows[-1].seconds - rows[0].seconds) / (len(rows) - 1)
 
 
-def processor(client: Client) -> tuple[float, dict[str, float]]:
-    """Return the processor times of this process and of the workers."""
-    return time.process_time(), client.run(time.process_time)
+def computing(stream: Any, steps: int) -> float:
+    """Return the seconds of a step that the busiest worker computes, of a stream of tasks."""
+    spans: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for task in stream.data:
+        for name in ("epigauge-linearize_state", "epigauge-advance"):
+            if task["key"].startswith(name):
+                found = [part for part in task["startstops"] if part["action"] == "compute"]
+                own = spans.setdefault((task["worker"], name), [])
+                own += [(part["start"], part["stop"]) for part in found]
+    busy: dict[str, float] = {}
+    for (worker, _), own in spans.items():
+        last = sorted(own)[-steps:]  # the start is linearised before the first step
+        busy[worker] = busy.get(worker, 0.0) + sum(stop - start for start, stop in last)
+    return max(busy.values()) / steps
 
 
 def peak_memory(pids: list[int]) -> int:
@@ -154,30 +173,37 @@ def speeds(observations: int, views: int, steps: int, rounds: int) -> None:
             spent = (time.process_time() - begin) / steps
             found.setdefault("in process", []).append((a_step(results["in process"]), spent, 0.0))
             for name, client in (("1 worker", single), ("2 workers", double)):
-                before, there = processor(client)
-                results[name] = eg.distributed.bundle_adjust(tracks, client, start, **options)
-                after, now = processor(client)
-                busiest = max(now[address] - there[address] for address in now)
-                row = a_step(results[name]), (after - before) / steps, busiest / steps
+                begin = time.process_time()
+                with get_task_stream(client) as stream:
+                    results[name] = eg.distributed.bundle_adjust(tracks, client, start, **options)
+                spent = (time.process_time() - begin) / steps
+                row = a_step(results[name]), spent, computing(stream, steps)
                 found.setdefault(name, []).append(row)
-    best = {name: np.min(rows, axis=0) for name, rows in found.items()}
+    best = {name: min(rows) for name, rows in found.items()}
     expected = results["in process"]
+    sigma = None
+    if len(tracks) <= _SURE:
+        sigma = eg.covariance(tracks, expected.reconstruction, noise_px=NOISE_PX).std.points
     table = []
     for name, (step, here, worker) in best.items():
         other = results[name]
+        away = aligned(other.reconstruction, expected.reconstruction).X - expected.reconstruction.X
         table.append(
             [
                 name,
                 f"{1e3 * step:.0f}",
                 f"{best['in process'][0] / step:.2f}",
                 f"{1e3 * here:.0f}",
-                f"{1e3 * worker:.0f}",
+                f"{1e3 * worker:.0f}" if worker else "",
+                f"{1e3 * (step - worker):.0f}" if worker else "",
                 f"{abs(other.cost / expected.cost - 1.0):.1e}",
-                f"{np.abs(other.reconstruction.X - expected.reconstruction.X).max():.1e}",
+                f"{np.abs(away).max():.1e}",
+                "" if sigma is None else f"{np.max(np.abs(away) / sigma):.1e}",
             ]
         )
     print(f"{len(tracks)} observations, {tracks.n_views} views, {tracks.n_points} points\n")
-    head = ["", "ms a step", "speed", "processor here", "in a worker", "cost off", "points off"]
+    head = ["", "ms a step", "speed", "processor here", "busiest worker", "rest"]
+    head += ["cost off", "points off", "of sigma"]
     print(markdown(head, table))
     ratio = best["1 worker"][0] / best["2 workers"][0]
     overhead = best["1 worker"][0] / best["in process"][0] - 1.0
