@@ -66,7 +66,8 @@ if TYPE_CHECKING:  # what a name stands for; `_WHERE` says the same to Python
     from epigauge.multi_view.tracks import Tracks
     from epigauge.multi_view.uncertainty import covariance
     from epigauge.scenes import MultiViewScene, TwoViewScene, multi_view_scene, two_view_scene
-    from epigauge.two_view.batch import BATCH_STATUS, FundamentalBatch, refine_fundamental_batch
+    from epigauge.two_view.batch import refine_fundamental_batch
+    from epigauge.two_view.batch_result import BATCH_STATUS, FundamentalBatch
     from epigauge.two_view.calibrated import estimate_essential
     from epigauge.two_view.geometry import (
         canonical_cameras,
@@ -208,7 +209,8 @@ _WHERE = {
     "multi_view.reconstruction_covariance": "ReconstructionCovariance",
     "multi_view.uncertainty": "covariance",
     "scenes": "MultiViewScene TwoViewScene multi_view_scene two_view_scene",
-    "two_view.batch": "BATCH_STATUS FundamentalBatch refine_fundamental_batch",
+    "two_view.batch": "refine_fundamental_batch",
+    "two_view.batch_result": "BATCH_STATUS FundamentalBatch",
     "two_view.calibrated": "estimate_essential",
     "two_view.geometry": ("canonical_cameras reprojection_distances sampson_distances triangulate"),
     "two_view.homography_refine": "refine_homography",

@@ -22,7 +22,8 @@ from epigauge._options import PairOptions, known_options
 from epigauge._results import Result
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.io._common import PathLike
-from epigauge.two_view.batch import BATCH_STATUS, FundamentalBatch, refine_fundamental_batch
+from epigauge.two_view.batch import refine_fundamental_batch
+from epigauge.two_view.batch_result import BATCH_STATUS, FundamentalBatch
 from epigauge.two_view.copies import earliest
 from epigauge.two_view.geometry import reprojection_distances
 from epigauge.two_view.initial import fundamental_8point

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from colmap_databases import SCHEMA, change, content, pair_id
 from epigauge import _colmap_verification as verification
+from epigauge._colmap_pair import verified
 from epigauge._processes import Processes
 from epigauge.io.colmap_raw import RawDatabase
 from two_views import up_to_sign
@@ -312,7 +313,7 @@ def test_processes_of_their_own_change_nothing(some, monkeypatch, capfd) -> None
     the_same(one, eg.colmap.verify_database(some, workers=2))
     with Processes(2) as pool:
         assert pool.submit(print, "said").result() is None  # and comes not between answers
-        bad = pool.submit(verification.verified, [None], {})
+        bad = pool.submit(verified, [None], {})
         with pytest.raises(TypeError):
             bad.result()
         assert pool.submit(abs, -3).result() == 3

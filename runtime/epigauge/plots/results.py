@@ -26,7 +26,7 @@ from epigauge.multi_view.tracks import Tracks
 from epigauge.plots._style import BLUE, GREY, RED, count_whole, finish, heading, new_figure
 from epigauge.plots.many_views import plot_bundle
 from epigauge.plots.precision import plot_precision
-from epigauge.two_view.batch import FundamentalBatch
+from epigauge.two_view.batch_result import FundamentalBatch
 from epigauge.two_view.homography_result import HomographyResult
 from epigauge.two_view.model import TwoViewResult
 from epigauge.uncertainty.affine import AffineCovariance, AffineStd

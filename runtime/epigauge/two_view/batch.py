@@ -3,30 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from concurrent.futures import Executor
 from functools import partial
-from itertools import chain
 from types import SimpleNamespace
-from typing import Any, TypeVar, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epigauge import arrays, lm
-from epigauge._arguments import as_array, as_count, as_matches, as_real, as_weights
+from epigauge import arrays
+from epigauge._arguments import as_array, as_matches, as_real, as_weights
 from epigauge._logged import logged
 from epigauge._options import PairOptions, known_options
 from epigauge.errors import ArgumentError
 from epigauge.two_view import native, quick, tensors
-from epigauge.two_view._partial import Partial
+from epigauge.two_view.batch_parts import elsewhere, no_callback, threads
+from epigauge.two_view.batch_result import FundamentalBatch
 from epigauge.two_view.copies import counted_once
 from epigauge.two_view.express import completed
 from epigauge.two_view.refine import plan_of, refine_fundamental
 from epigauge.two_view.result import FundamentalResult
 from epigauge.two_view.tensors import REFUSED
 
-__all__ = ["BATCH_STATUS", "FundamentalBatch", "refine_fundamental_batch"]
+__all__ = ["as_offsets", "check_options", "refine_fundamental_batch"]
 
 Array = NDArray[np.float64]
 
@@ -35,83 +34,6 @@ _CHUNK = 64
 
 #: Pairs that go to an executor at a time: results travel back, so that there are more.
 _PART = 4 * _CHUNK
-
-#: Meaning of `FundamentalBatch.status`.
-BATCH_STATUS = lm.STATUS | {REFUSED: "the matches of this pair cannot determine F: see `reasons`"}
-
-
-@dataclass(frozen=True)
-class FundamentalBatch(Partial):
-    """Results of many pairs, one row a pair; fields as in `FundamentalResult`.
-
-    Attributes
-    ----------
-    F : ndarray, shape (n, 3, 3)
-        Fundamental matrices; zero where the pair was refused.
-    sigma, cost, rms_px, noise_px, condition : ndarray, shape (n,)
-        Per pair; zero where it was refused, `condition` infinite.
-    covariance : ndarray, shape (n, 9, 9)
-        Covariance of vect(F); infinite on the diagonal where it is not determined.
-    rank, nfev, njev, nit, status : ndarray of int, shape (n,)
-        Per pair; `status` is that of `BATCH_STATUS`, -9 for a refused pair.
-    success : ndarray of bool, shape (n,)
-        Whether the pair may be used, as `FundamentalResult.success`; computed when asked for.
-    distances : ndarray, shape (m,)
-        Signed distances of all matches, in the order they were given.
-    reasons : dict of int to str
-        Why a pair was refused, by its number.
-    flags : tuple of tuple of str
-        What each pair's matches do not support, as `FundamentalResult.flags`; empty for refused
-        pairs. Computed when asked for.
-
-    Examples
-    --------
-    >>> import epigauge as eg
-    >>> matches = eg.load_matches(eg.samples.path("matches.csv"))
-    >>> result = eg.refine_fundamental_batch(matches.x1, matches.x2, [0, len(matches)])
-    >>> result.F.shape, result.success.tolist(), result.reasons
-    ((1, 3, 3), [True], {})
-    """
-
-    F: Array
-    sigma: Array
-    cost: Array
-    rms_px: Array
-    noise_px: Array
-    condition: Array
-    covariance: Array
-    rank: NDArray[np.intp]
-    nfev: NDArray[np.intp]
-    njev: NDArray[np.intp]
-    nit: NDArray[np.intp]
-    status: NDArray[np.intp]
-    success: NDArray[np.bool_]
-    distances: Array
-    reasons: dict[int, str]
-    flags: tuple[tuple[str, ...], ...]
-
-    def __len__(self) -> int:
-        """Return the number of pairs."""
-        return len(self.F)
-
-    def _arrays(self) -> dict[str, Any]:
-        reasons = [self.reasons.get(k, "") for k in range(len(self))]
-        flags = ["; ".join(names) for names in self.flags]
-        return self._contents() | {"reasons": reasons, "flags": flags}
-
-    def _heading(self) -> str:
-        return f"FundamentalBatch: {len(self)} pairs"
-
-    def _summary_rows(self) -> dict[str, str]:
-        done, refused = self.status > 0, len(self.reasons)
-        rows = {"converged": f"{np.count_nonzero(done)} of {len(self)}", "refused": str(refused)}
-        if done.any():
-            rows["median rms_px"] = f"{np.median(self.rms_px[done]):.6g}"
-            rows["median nfev"] = f"{np.median(self.nfev[done]):g}"
-        return rows
-
-    def _explained(self) -> dict[str, str]:
-        return {f"pair {k}": reason for k, reason in list(self.reasons.items())[:5]}
 
 
 @logged
@@ -203,118 +125,6 @@ def refine_fundamental_batch(
     chunks = [range(first, min(first + size, count)) for first in range(0, count, size)]
     threads(work.refine, chunks, workers, progress)
     return work.result(flags)
-
-
-def threads(
-    work: Callable[[range], object],
-    chunks: list[range],
-    workers: int,
-    progress: Callable[[int, int], object] | None,
-) -> None:
-    """Work on chunks of pairs in threads; tell of every pair from the calling one."""
-    done, count = 0, chunks[-1].stop if chunks else 0
-    with ThreadPoolExecutor(as_count("workers", workers)) as pool:
-        futures = {pool.submit(work, chunk): chunk for chunk in chunks}
-        try:
-            for future in as_completed(futures):
-                future.result()
-                for _ in futures[future]:
-                    done += 1
-                    if progress is not None:
-                        progress(done, count)
-        finally:  # the pool waits for what was submitted: after an error or Ctrl-C, drop the rest
-            for future in futures:
-                future.cancel()
-
-
-Batch = TypeVar("Batch", bound=FundamentalBatch)
-
-
-def elsewhere(
-    executor: Executor,
-    call: Callable[..., Batch],
-    matches: tuple[Array, Array, NDArray[np.intp]],
-    per_match: dict[str, Array | None],
-    per_pair: dict[str, Array | None],
-    size: int,
-    progress: Callable[[int, int], object] | None,
-) -> Batch:
-    """Call a batch function for parts of some pairs wherever an executor has room.
-
-    Parameters
-    ----------
-    executor : Executor
-        As of `refine_fundamental_batch`.
-    call : callable
-        Takes x1, x2 and offsets of a part, and the arguments by name; computes everything, since
-        results travel back. A `functools.partial` of the function and of its other options.
-    matches : (ndarray, ndarray, ndarray)
-        x1, x2 and offsets of all pairs.
-    per_match, per_pair : dict
-        Arguments with a row a match, and with a row a pair.
-    size : int
-        Pairs a part.
-    progress : callable or None
-        As of `refine_fundamental_batch`.
-
-    Returns
-    -------
-    FundamentalBatch
-        The results in order, of the kind that `call` returns.
-    """
-    x1, x2, bounds = matches
-    count = len(bounds) - 1
-    if not callable(getattr(executor, "submit", None)):
-        needed = "one as of concurrent.futures: it has a method submit"
-        raise ArgumentError("executor", f"is of type {type(executor).__name__}", needed)
-    futures = {}
-    for first in range(0, max(count, 1), size):
-        last = min(first + size, count)
-        rows, own = slice(int(bounds[first]), int(bounds[last])), slice(first, last)
-        more = {
-            name: None if value is None else value[chosen]
-            for arguments, chosen in ((per_match, rows), (per_pair, own))
-            for name, value in arguments.items()
-        }
-        offsets = bounds[first : last + 1] - bounds[first]
-        futures[first] = executor.submit(call, x1[rows], x2[rows], offsets, **more)
-    parts: list[Batch] = []
-    done = 0
-    try:
-        for first, future in futures.items():
-            parts.append(future.result())
-            for _ in range(min(size, count - first)):
-                done += 1
-                if progress is not None:
-                    progress(done, count)
-    finally:  # after an error or Ctrl-C, drop what has not begun
-        for future in futures.values():
-            future.cancel()
-    return _joined(parts, list(futures), bounds)
-
-
-def no_callback(options: dict[str, Any]) -> None:
-    """Refuse a callback among options that travel."""
-    if options.get("callback") is not None:
-        raise ArgumentError("callback", "cannot be called from elsewhere", "none with an executor")
-
-
-def _joined(parts: list[Batch], firsts: list[int], bounds: NDArray[np.intp]) -> Batch:
-    """Put parts of a batch together, which begin with these pairs."""
-    values: dict[str, Any] = {}
-    for name in type(parts[0]).__dataclass_fields__:
-        own = [getattr(part, name) for part in parts]
-        if name == "reasons":
-            values[name] = {
-                first + k: reason
-                for first, reasons in zip(firsts, own, strict=True)
-                for k, reason in reasons.items()
-            }
-        elif name == "offsets":
-            values[name] = bounds
-        else:
-            values[name] = tuple(chain(*own)) if name == "flags" else np.concatenate(own)
-    return type(parts[0])(**values)
 
 
 def as_offsets(offsets: ArrayLike, m: int) -> NDArray[np.intp]:

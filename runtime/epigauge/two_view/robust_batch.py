@@ -16,14 +16,9 @@ from epigauge._arguments import as_count, as_matches, as_positive, as_score, as_
 from epigauge._logged import logged
 from epigauge._options import FrontEnd, PairOptions, known_options
 from epigauge.errors import ArgumentError
-from epigauge.two_view.batch import (
-    FundamentalBatch,
-    as_offsets,
-    check_options,
-    elsewhere,
-    no_callback,
-    threads,
-)
+from epigauge.two_view.batch import as_offsets, check_options
+from epigauge.two_view.batch_parts import elsewhere, no_callback, threads
+from epigauge.two_view.batch_result import FundamentalBatch
 from epigauge.two_view.confidence import probability_below
 from epigauge.two_view.front_ends import checked
 from epigauge.two_view.robust import RobustResult, estimated
