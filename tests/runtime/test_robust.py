@@ -474,6 +474,19 @@ def test_wrong_matches_beside_the_right_point_are_not_taken_for_noise(seed):
     assert result.inlier[38:].mean() > 0.8
 
 
+@pytest.mark.parametrize("seed", [0, 1, 4])
+def test_what_moved_on_its_own_does_not_bend_a_sharp_geometry(seed):
+    """As clouds between two photographs: all matches agree with an F in between, but bluntly."""
+    scene = eg.two_view_scene(n_points=150, distance=4.0, noise_px=0.2, seed=seed)
+    x2, top = scene.x2.copy(), np.argsort(scene.x1[:, 1])[:40]
+    angle = np.random.default_rng(300 + seed).uniform(0.0, 2.0 * np.pi)
+    x2[top] += 8.0 * np.array([np.cos(angle), np.sin(angle)])
+    result = eg.estimate_fundamental(scene.x1, x2)
+    assert error(result.F, scene) < 0.3
+    assert not result.inlier[top].any()
+    assert np.mean(np.delete(result.inlier, top)) > 0.95
+
+
 def test_normal_distances_have_no_wrong_ones_about_them():
     # Nothing is gained by a core and what is around it: the noise stays that of all.
     for seed in range(2):

@@ -14,12 +14,19 @@ from numpy.typing import NDArray
 from epigauge._arguments import as_choice
 from epigauge.errors import MissingPackageError
 from epigauge.kernels import Table
-from epigauge.two_view.chance import SIGNIFICANT, chance_agreement, log10_false_alarms
+from epigauge.two_view.chance import (
+    SIGNIFICANT,
+    chance_agreement,
+    chances_off_plane,
+    log10_false_alarms,
+)
 from epigauge.two_view.conditioning import RMS
-from epigauge.two_view.consensus import Agreement, Consensus
+from epigauge.two_view.consensus import RANGE, Agreement, Consensus
+from epigauge.two_view.homography import plane_squares, robust_homography
 from epigauge.two_view.initial import fundamental_8point
 from epigauge.two_view.neighbours import accord, ranked
-from epigauge.two_view.search import SCALES, search
+from epigauge.two_view.planes import OFF_PLANE, chance_pairs
+from epigauge.two_view.search import SCALES, Found, search
 
 __all__ = ["checked", "start"]
 
@@ -38,6 +45,9 @@ _DEVIATIONS = 3.0
 
 #: The noise is found where so many of the matches within four times its limit are within it.
 _SHARP = 0.5
+
+#: Of blunt ones so many are; a geometry that fits seven of few can be chosen so that more are.
+_BY_CHANCE = 0.25
 
 #: Among fewer matches, some agree so sharply by chance; each search is then made twice.
 _MANY = 400
@@ -134,32 +144,57 @@ def _native(
 ) -> Agreement | None:
     """Search at the noise of good detectors, and at more of it where that may not be the noise.
 
-    At more noise the likelihood of all matches decides, climbed from all that was found.
+    At more noise the likelihood of all matches decides, climbed from all that was found. Where few
+    match, it is that of an F which bends to what has moved, as clouds, or stands beside: many more
+    agree with it, but bluntly. Another that many agree with sharply, which is no accident, is that
+    of the scene then: a detector is not sharp for some matches and blunt for the others.
     """
     few = consensus.few
     q1, q2 = (np.ascontiguousarray(h[:2, few]) for h in (consensus.h1, consensus.h2))
     order = ranked(kernels, q1, q2) if score is None else np.argsort(-score[few], kind="stable")
     agreements: list[Agreement] = []
+    sharp: list[Agreement] = []
     turns = 1 if q1.shape[1] >= _MANY else 2 if q1.shape[1] >= _FEW else 4
     for scale, turn in itertools.product(SCALES, range(turns)):
         found = search(kernels, q1, q2, order, seed=seed + turn, scale=scale)
         if not found.score > 0.0:
             continue
-        if scale == SCALES[0] and q1.shape[1] >= _MANY:
-            sharp = consensus.judge(found.F, scale, extent=_EXTENT * scale)
-            if _is_sharp(kernels, q1, q2, sharp, sharp.signed[few], scale):
-                return _Repeats(consensus, kernels, q1, q2, scale).avoided(sharp, order, seed)
-            if sharp.sigma <= _BLUNT * scale:
-                climbed = consensus.climb(consensus.judge(found.F, scale))
-                own = max(scale, climbed.sigma)
-                if own <= _BLUNT * scale and _is_sharp(
-                    kernels, q1, q2, climbed, climbed.signed[few], own
-                ):
-                    return climbed
+        if scale == SCALES[0] and (own := _sharp(consensus, kernels, q1, q2, found)) is not None:
+            if q1.shape[1] < _MANY:
+                sharp.append(own)
+            elif own.extent < RANGE:
+                return _Repeats(consensus, kernels, q1, q2, scale).avoided(own, order, seed)
+            else:
+                return own
         agreements.append(consensus.judge(found.F, scale))
     if not agreements:
         return None
-    return consensus.heavier(consensus.search(agreements, rng), agreements)
+    best = consensus.search(agreements, rng)
+    if best.sigma > _BLUNT * SCALES[0] and sharp:
+        extent = _EXTENT * SCALES[0]
+        alike = (consensus.judge(own.F, own.sigma, own.share, extent) for own in sharp)
+        highest = max(alike, key=lambda own: own.score)
+        if not _is_of_a_plane(kernels, q1, q2, highest, few):
+            return highest
+    return consensus.heavier(best, agreements)
+
+
+def _sharp(
+    consensus: Consensus, kernels: Table, q1: Array, q2: Array, found: Found
+) -> Agreement | None:
+    """Return the agreement with an F if it is sharp, or the sharp one that it climbs to, if any."""
+    few, scale = consensus.few, found.scale
+    own = consensus.judge(found.F, scale, extent=_EXTENT * scale)
+    if _is_sharp(kernels, q1, q2, own, own.signed[few], scale):
+        return own
+    if own.sigma <= _BLUNT * scale:
+        climbed = consensus.climb(consensus.judge(found.F, scale))
+        limit = max(scale, climbed.sigma)
+        if limit <= _BLUNT * scale and _is_sharp(
+            kernels, q1, q2, climbed, climbed.signed[few], limit
+        ):
+            return climbed
+    return None
 
 
 def _is_sharp(
@@ -176,8 +211,23 @@ def _is_sharp(
     )
     if hits <= _SHARP * around or core <= 0.5 * hits:
         return False
+    if log10_false_alarms(int(around) + 7, int(hits) + 7, _BY_CHANCE) > 0.0:
+        return False
     chance = chance_agreement(kernels, found.F, q1, q2, limit)
     return log10_false_alarms(q1.shape[1], int(hits) + 7, chance) <= SIGNIFICANT
+
+
+def _is_of_a_plane(kernels: Table, q1: Array, q2: Array, found: Agreement, few: slice) -> bool:
+    """Tell whether a plane leaves F open: those off it agree no better than wrong ones would."""
+    limit = _DEVIATIONS * SCALES[0]
+    near = found.inliers(limit)[few]
+    on1, on2 = (np.ascontiguousarray(q[:, near]) for q in (q1, q2))
+    H, _ = robust_homography(on1, on2, np.ones(on1.shape[1]), kernels)
+    squares = plane_squares(kernels, H, q1, q2)
+    off = squares > 2.0 * (OFF_PLANE * found.sigma) ** 2
+    chances = chances_off_plane(squares[off], limit)
+    expected = chance_pairs(chances, int(np.count_nonzero(off & near)))
+    return bool(expected > 10.0**SIGNIFICANT)
 
 
 @dataclass(frozen=True)

@@ -197,7 +197,8 @@ def estimate_fundamental(
     the coordinates, and the likelihood is climbed from what the search found at several noises and
     from 8-point estimates of random subsets of the inliers, until that finds nothing higher. A part
     of the wrong matches may then be normal, too, but wide, where that leaves right ones which are
-    at least twice as sharp.
+    at least twice as sharp. An F that most agree with sharply, no plane's alone and no accident,
+    counts more than one that nearly all agree with, but bluntly.
     Matches that violate the oriented epipolar constraint count as wrong.
 
     Windows of a facade that are taken for others of their row agree with an F of their own, whose
