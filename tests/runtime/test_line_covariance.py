@@ -41,9 +41,8 @@ def cov(scene: eg.LineScene, found: eg.MetricReconstruction) -> eg.MetricCovaria
     return eg.covariance(scene.tracks, found, noise_px=1.5, refine="pose", lines=lines)
 
 
-def test_blocks_are_those_of_a_dense_inverse(
-    scene: eg.LineScene, found: eg.MetricReconstruction, cov: eg.MetricCovariance
-) -> None:
+def dense(scene: eg.LineScene, found: eg.MetricReconstruction) -> tuple[Any, LineLinearizer, Array]:
+    """Return the problem of `scene`, its lines, and all derivatives, (200, 98)."""
     tracks, lines = scene.tracks, scene.line_tracks
     made = line_problem(tracks, found, lines, table(), refine="pose")
     at, job = made.start, made.job
@@ -61,7 +60,15 @@ def test_blocks_are_those_of_a_dense_inverse(
         first = 30 + 3 * tracks.point[k] if k < 60 else 66 + 4 * lines.line[k - 60]
         width = 3 if k < 60 else 4
         J[:, k, first : first + width] = (B if k < 60 else B_lines)[:, :, k % 60]
-    _, values, Vt = np.linalg.svd(J.reshape(-1, size))
+    return made, kind, J.reshape(-1, size)
+
+
+def test_blocks_are_those_of_a_dense_inverse(
+    scene: eg.LineScene, found: eg.MetricReconstruction, cov: eg.MetricCovariance
+) -> None:
+    made, kind, J = dense(scene, found)
+    at, size = made.start, J.shape[1]
+    _, values, Vt = np.linalg.svd(J)
     assert values[-7] < 1e-9 * values[-8]
     G, rest = Vt[-7:].T, Vt[:-7]
     X = (rest.T / values[:-7] ** 2) @ rest
@@ -250,22 +257,8 @@ def test_priors_count_beside_lines_as_in_a_dense_inverse(scene: eg.LineScene) ->
     options: dict[str, Any] = {"noise_px": noise, "refine": "pose", "lines": lines}
     cov = eg.covariance(tracks, found, priors=priors, **options)
     assert cov.open == 0
-    made = line_problem(tracks, found, lines, table(), refine="pose")
-    at, job, scale = made.start, made.job, made.home.scale
-    graph = ObservationGraph(tracks.view, tracks.point, 5, 12)
-    parts = job.model, table(), graph, job.q, np.ones(60), Loss()
-    _, A, B = NumpyLinearizer(*parts).observe(at.cameras, at.points)
-    (kind,) = made.problem.kinds
-    assert isinstance(kind, LineLinearizer)
-    _, A_lines, B_lines = kind.observe(at.cameras, at.others[0])
-    size = 6 * 5 + 3 * 12 + 4 * 8
-    J = np.zeros((2, 100, size))
-    for k in range(100):
-        i = (tracks.view if k < 60 else lines.view)[k % 60]
-        J[:, k, 6 * i : 6 * i + 6] = (A if k < 60 else A_lines)[:, :6, k % 60]
-        first = 30 + 3 * tracks.point[k] if k < 60 else 66 + 4 * lines.line[k - 60]
-        width = 3 if k < 60 else 4
-        J[:, k, first : first + width] = (B if k < 60 else B_lines)[:, :, k % 60]
+    made, _, J = dense(scene, found)
+    at, size, scale = made.start, J.shape[1], made.home.scale
 
     def known(step: Array) -> Array:
         """Return what is known after a step, each number over its deviation."""
@@ -279,7 +272,7 @@ def test_priors_count_beside_lines_as_in_a_dense_inverse(scene: eg.LineScene) ->
 
     h = 1e-6
     slopes = [(known(h * row) - known(-h * row)) / (2.0 * h) for row in np.eye(size)]
-    rows = np.concatenate([J.reshape(-1, size), noise / scale * np.transpose(slopes)])
+    rows = np.concatenate([J, noise / scale * np.transpose(slopes)])
     X = noise**2 * np.linalg.inv(rows.T @ rows)
     for k in (0, 5):
         own = slice(66 + 4 * k, 70 + 4 * k)
