@@ -448,7 +448,11 @@ def _picked(points1: Array, points2: Array, matches: ArrayLike) -> tuple[Array, 
         if len(bad):
             was = f"join keypoint {column[bad[0]]} of image {image} in row {bad[0]}"
             raise ArgumentError("matches", was, f"numbers below {len(points)}")
-    return as_matches(points1[indices[:, 0], :2], points2[indices[:, 1], :2], at_least=0)
+    try:
+        return as_matches(points1[indices[:, 0], :2], points2[indices[:, 1], :2], at_least=0)
+    except ArgumentError as error:
+        name = {"x1": "keypoints1", "x2": "keypoints2"}.get(error.argument, error.argument)
+        raise ArgumentError(name, error.was.replace("row", "match"), error.needed) from None
 
 
 def _calibration(name: str, camera: Any) -> Array:

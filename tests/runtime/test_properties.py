@@ -87,8 +87,8 @@ def triangulate_lines(view: Any, line: Any, segments: Any) -> Any:
     return eg.triangulate_lines(eg.LineTracks(view, line, segments), LINES.true)
 
 
-def transform(P: Any, Q: Any, T: Any, a: Any, b: Any) -> Any:
-    return eg.gauge.transform(eg.Reconstruction(P, Q), T, a, b)
+def transform(P: Any, Q: Any, T: Any, camera_scales: Any, point_scales: Any) -> Any:
+    return eg.gauge.transform(eg.Reconstruction(P, Q), T, camera_scales, point_scales)
 
 
 _MATCHES = {"x1": (X1, "px"), "x2": (X2, "px")}
@@ -122,8 +122,8 @@ ROWS = {
         _START
         | {
             "T": (np.eye(4) + np.diag([1.0, 0.0, 2.0], 1), "px"),
-            "a": (np.arange(1.0, 5.0), "px"),
-            "b": (np.arange(1.0, 21.0), "px"),
+            "camera_scales": (np.arange(1.0, 5.0), "px"),
+            "point_scales": (np.arange(1.0, 21.0), "px"),
         },
     ),
     "focal_lengths": Row(
@@ -137,7 +137,7 @@ ROWS = {
         {
             "keypoints1": (X1, "px"),
             "keypoints2": (X2, "px"),
-            "matches": (np.arange(40).reshape(20, 2) % 30, "index"),
+            "matches": (np.arange(60).reshape(30, 2) % 29 + 1, "index"),
         },
     ),
     "interop.move_fundamental": Row(
@@ -412,6 +412,72 @@ def test_arrays_that_cannot_be_used_are_refused(name) -> None:
             else:
                 if any(not isinstance(v, str) and np.isnan(v).any() for v in found):
                     problems.append(f"{argument}, {what}: there is NaN in the result")
+    assert not problems, "\n".join(problems)
+
+
+# Tables of other libraries
+
+
+def of_pandas(a: np.ndarray, nullable: bool = False) -> Any:
+    """Return a table or column of pandas; more than two dimensions it does not have."""
+    pandas = pytest.importorskip("pandas", reason="needs pandas")
+    if a.ndim > 2:
+        return a
+    made = pandas.DataFrame(a) if a.ndim == 2 else pandas.Series(a)
+    return made.convert_dtypes() if nullable else made
+
+
+def of_xarray(a: np.ndarray) -> Any:
+    return pytest.importorskip("xarray", reason="needs xarray").DataArray(a)
+
+
+def of_polars(a: np.ndarray) -> Any:
+    polars = pytest.importorskip("polars", reason="needs polars")
+    if a.ndim > 2:
+        return a
+    return polars.DataFrame(a) if a.ndim == 2 else polars.Series(a)
+
+
+LIBRARIES: dict[str, Callable[[np.ndarray], Any]] = {
+    "pandas": of_pandas,
+    "pandas, nullable": lambda a: of_pandas(a, nullable=True),
+    "xarray": of_xarray,
+    "polars": of_polars,
+}
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_tables_of_other_libraries_are_arrays(library) -> None:
+    for name in ROWS:
+        expected = called(name, lambda a, _: a.copy())
+        found = called(name, lambda a, _: LIBRARIES[library](a))
+        assert len(found) == len(expected)
+        for one, other in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(one, other, err_msg=name)
+
+
+@pytest.mark.parametrize("library", ["pandas, nullable", "xarray"])
+@pytest.mark.parametrize("what", ["words", "an entry that is missing"])
+def test_tables_that_hold_no_numbers_are_refused_by_name(library, what) -> None:
+    problems = []
+    for name, row in ROWS.items():
+        for argument, (array, kind) in row.arrays.items():
+            if kind == "image" or array.ndim > 2:
+                continue
+            bad = array.astype(str) if what == "words" else array.astype(np.float64)
+            if what != "words":
+                bad.flat[-1] = np.nan
+            table = LIBRARIES[library](bad)
+            given = {other: value for other, (value, _) in row.arrays.items()} | {argument: table}
+            try:
+                row.call(**given)
+            except EpigaugeError as error:
+                if argument not in str(error):
+                    problems.append(f"{name}: {argument} is not named in: {error}")
+            except Exception as error:
+                problems.append(f"{name}, {argument}: {error!r}")
+            else:
+                problems.append(f"{name}, {argument}: taken")
     assert not problems, "\n".join(problems)
 
 

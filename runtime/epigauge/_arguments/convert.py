@@ -45,11 +45,24 @@ def on_host(name: str, value: Any) -> Any:
         if hasattr(value, "__cuda_array_interface__") and hasattr(value, "get"):
             return value.get()
         if hasattr(value, "to_numpy") and np.asarray(value).dtype.hasobject:
-            return value.to_numpy(dtype=np.float64, na_value=np.nan)
+            return _nullable(value)
     except (TypeError, ValueError, RuntimeError) as error:
         was = f"is a {type(value).__name__} that is no array"
         raise ArgumentError(name, was, f"numbers of a usual type ({error})") from None
     return value
+
+
+def _nullable(value: Any) -> Any:
+    """Return a table or column of pandas that has a mask; any other as it is, to be refused.
+
+    Text that reads as numbers is text, as in an array.
+    """
+    types = np.asarray(getattr(value, "dtypes", getattr(value, "dtype", None)), dtype=object)
+    kinds = {getattr(of_column, "kind", "O") for of_column in types.flat}
+    if not kinds <= set("iuf"):
+        return value
+    whole = kinds <= set("iu") and not np.any(value.isna())
+    return value.to_numpy(dtype=np.int64 if whole else np.float64, na_value=np.nan)
 
 
 def as_array(name: str, value: ArrayLike, needed: str) -> NDArray[Any]:
