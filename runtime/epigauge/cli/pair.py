@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,7 +37,8 @@ from epigauge.cli._models import (
 from epigauge.cli._targets import Plot, Targets, outputs
 from epigauge.cli.refine import epipoles, standard_deviations
 from epigauge.errors import ArgumentError
-from epigauge.images import ImageMatches, match_images
+from epigauge.images import ImageMatches, load_image, match_images
+from epigauge.images.loading import Image
 from epigauge.images.summary import match_rows, summary
 from epigauge.io import plain, save_result
 from epigauge.two_view.robust import RobustResult
@@ -110,9 +112,10 @@ def pair(
     out = console()
     begin = time.perf_counter()
     with out.status("matching"):
-        matches = match_images(
-            image1,
-            image2,
+        photos = load_image(image1), load_image(image2)  # once, for a picture too
+        matches = _matched(
+            photos,
+            (image1, image2),
             detector=detector,
             ratio=ratio,
             max_size=max_size,
@@ -149,7 +152,7 @@ def pair(
     std_F, std_sigma = standard_deviations(result.F, result.covariance)
     more |= {"std_F": std_F, "std_sigma": std_sigma, "epipoles": epipoles(result.F)}
     targets.save(lambda path: save_result(path, result, **more, **for_file(found, path)))
-    targets.draw(lambda path: _draw(path, result, matches, (image1, image2), seconds))
+    targets.draw(lambda path: _draw(path, result, matches, photos, seconds))
     if json:
         everything = plain(result)
         del everything["jac"]
@@ -162,6 +165,17 @@ def pair(
             for row in result.F if result.E is None else result.E:
                 typer.echo(" ".join(f"{value: 24.17g}" for value in row))
     return DONE if result.success else NOT_CONVERGED
+
+
+def _matched(photos: tuple[Image, Image], paths: tuple[Path, Path], **options: Any) -> ImageMatches:
+    """Match photographs that have been read; results and errors name their files."""
+    try:
+        matches = match_images(*photos, **options)
+    except ArgumentError as error:
+        files = dict(zip(("image1", "image2"), map(shown, paths), strict=True))
+        name = files.get(error.argument, error.argument)
+        raise ArgumentError(name, error.was, error.needed) from None
+    return replace(matches, name=" - ".join(path.stem for path in paths))
 
 
 def _check(matches: ImageMatches, names: str) -> None:
@@ -182,7 +196,7 @@ def _draw(
     path: Path,
     result: RobustResult,
     matches: ImageMatches,
-    images: tuple[Path, Path],
+    images: tuple[Image, Image],
     seconds: tuple[float, float],
 ) -> None:
     """Write the picture or the report."""

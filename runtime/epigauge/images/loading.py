@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from epigauge._arguments import as_array
 from epigauge.errors import ArgumentError, FileFormatError, MissingPackageError
 from epigauge.io._common import PathLike, cut
 
@@ -96,7 +97,9 @@ def load_image(path: PathLike) -> Image:
         image = None
     if image is None:
         raise FileFormatError(path, "is damaged, or no image that OpenCV reads")
-    return np.ascontiguousarray(_to_8_bits(image if image.ndim == 2 else image[:, :, ::-1]))
+    image = _to_8_bits(image)
+    # OpenCV's own exchange of blue and red takes a tenth of the time of a copy by NumPy.
+    return np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 
 
 def thumbnail(path: PathLike, size: int = 192) -> bytes:
@@ -153,10 +156,7 @@ def as_image(name: str, image: PathLike | ArrayLike) -> Image:
     """
     if isinstance(image, str | os.PathLike):
         return load_image(image)
-    try:
-        array = np.asarray(image)
-    except ValueError:
-        raise ArgumentError(name, "is not a regular array", _NEEDED) from None
+    array = as_array(name, image, _NEEDED)
     if array.dtype.kind not in "buif":
         raise ArgumentError(name, f"has type {cut(array.dtype)}", _NEEDED)
     if array.ndim == 3 and array.shape[2] in (1, 4):

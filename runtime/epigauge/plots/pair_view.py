@@ -46,10 +46,15 @@ def reduced(photo: Image, longest: int) -> tuple[Image, tuple[int, int]]:
     """
     height, width = photo.shape[:2]
     step = min(-(-max(height, width) // longest), height, width)
-    rows, columns = height // step, width // step
-    squares = photo[: rows * step, : columns * step].reshape(rows, step, columns, step, -1)
-    smaller = squares.mean(axis=(1, 3), dtype=np.float32).astype(np.uint8)
-    return smaller.reshape(rows, columns, *photo.shape[2:]), (columns * step, rows * step)
+    bottom, right = height // step * step, width // step * step
+    # Sums run along the memory: rows first, then columns of what is left.
+    rows = np.zeros((bottom // step, right, *photo.shape[2:]), dtype=np.uint32)
+    for k in range(step):
+        rows += photo[k:bottom:step, :right]
+    total = rows[:, ::step]
+    for k in range(1, step):
+        total = total + rows[:, k::step]
+    return (total // step**2).astype(np.uint8), (right, bottom)
 
 
 def draw_photo(axes: Axes, photo: Image) -> None:
