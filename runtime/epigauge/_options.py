@@ -17,6 +17,7 @@ __all__ = [
     "AdjustOptions",
     "Backend",
     "BundleDamping",
+    "CameraGroups",
     "Criterion",
     "Detector",
     "FrontEnd",
@@ -29,6 +30,7 @@ __all__ = [
     "Method",
     "PairDamping",
     "PairOptions",
+    "Pairing",
     "Parameterization",
     "Part",
     "RefineOptions",
@@ -37,6 +39,7 @@ __all__ = [
     "Schedule",
     "Structure",
     "TwoViewModel",
+    "UpgradeModel",
     "known_options",
 ]
 
@@ -76,6 +79,12 @@ Rigs = Literal["keep", "drop"]
 GaugeName = Literal["reference_camera", "two_cameras", "five_points", "normalized"]
 
 Detector = Literal["sift", "orb", "akaze", "brisk", "kaze"]
+Pairing = Literal["all", "sequential", "ranked"]
+
+UpgradeModel = Literal[
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"
+]
+CameraGroups = Literal["auto", "one", "own", "size"]
 
 
 class PairOptions(TypedDict, total=False):

@@ -122,7 +122,7 @@ def bundle(
         ),
     ] = None,
     colmap: Annotated[
-        Path | None, typer.Option(help="Directory for a COLMAP text model with pinhole cameras.")
+        Path | None, typer.Option(help="Folder for a COLMAP text model with pinhole cameras.")
     ] = None,
     y_up: Annotated[
         bool | None,

@@ -46,7 +46,7 @@ class Trials:
 
 def demo(
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Directory for the pictures; made if absent.")
+        Path, typer.Option("--output", "-o", help="Folder for the pictures; made if absent.")
     ] = Path(),
     distance: Annotated[float, typer.Option(help="Cameras to points, in metres.")] = 10.0,
     trials: Annotated[int, typer.Option(help="Scenes to average over.")] = 20,

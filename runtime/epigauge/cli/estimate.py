@@ -21,7 +21,10 @@ from epigauge.two_view.confidence import error_text
 
 def estimate(
     matches: Annotated[
-        Path, typer.Argument(help="CSV, TXT or NPZ: x1, y1, x2, y2 in pixels.", show_default=False)
+        Path,
+        typer.Argument(
+            help="CSV, TXT, NPZ, NPY or HDF5: x1, y1, x2, y2 in pixels.", show_default=False
+        ),
     ],
     model: Model = "F",
     intrinsics: Intrinsics = None,

@@ -13,11 +13,13 @@ from rich.console import Console
 from rich.markup import escape
 
 import epigauge as eg
+from epigauge._options import UpgradeModel
 from epigauge.cameras import camera_model
 from epigauge.cli._common import (
     DONE,
     NOT_CONVERGED,
     Json,
+    choice,
     console,
     facts,
     given,
@@ -34,7 +36,9 @@ from epigauge.io._npz_scene import write_npz_scene
 from epigauge.multi_view.display import display
 from epigauge.verdicts import explained, usable
 
-__all__ = ["camera_rows", "metric"]
+__all__ = ["Camera", "camera_rows", "metric"]
+
+Camera = Annotated[UpgradeModel, choice(UpgradeModel, "Camera model.")]
 
 
 def metric(
@@ -56,7 +60,7 @@ def metric(
         ),
     ] = None,
     plot: Plot = None,
-    camera: Annotated[str, typer.Option(help="Camera model.")] = "SIMPLE_RADIAL",
+    camera: Camera = "SIMPLE_RADIAL",
     own_cameras: Annotated[
         bool, typer.Option("--own-cameras", help="Each view has a camera of its own.")
     ] = False,

@@ -41,7 +41,10 @@ FROM_FILE = ("x1", "x2", "x1, x2", "weights")
 
 def refine(
     matches: Annotated[
-        Path, typer.Argument(help="CSV, TXT or NPZ: x1, y1, x2, y2 in pixels.", show_default=False)
+        Path,
+        typer.Argument(
+            help="CSV, TXT, NPZ, NPY or HDF5: x1, y1, x2, y2 in pixels.", show_default=False
+        ),
     ],
     parameterization: Annotated[
         Parameterization, choice(Parameterization, "How F is represented.")

@@ -52,13 +52,13 @@ def reproduce(
     ] = None,
     trials: Annotated[int, typer.Option(help="Trials a configuration; the paper has 100.")] = 10,
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Directory for the report; made if absent.")
+        Path, typer.Option("--output", "-o", help="Folder for the report; made if absent.")
     ] = Path(),
     seed: Annotated[int, typer.Option(help="Seed of the first trial.")] = 0,
 ) -> int:
     """Repeat the experiments of a paper: tables, figures, and each claim checked.
 
-    Writes bs2004.md, bs2004.html and the directory bs2004 with CSV and PNG
+    Writes bs2004.md, bs2004.html and the folder bs2004 with CSV and PNG
     files. Several experiments are separated by commas or by repeating --only.
     The measured image pairs of Table 4 are looked for in the folder pairs of
     EPIGAUGE_DATA, or of ../shared/data.

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import numpy as np
 import typer
@@ -18,11 +18,13 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 import epigauge as eg
+from epigauge._arguments import as_choice
+from epigauge._options import CameraGroups, Pairing, UpgradeModel
 from epigauge.cameras import camera_model
-from epigauge.cli._common import DONE, NOT_CONVERGED, console, facts, shown
+from epigauge.cli._common import DONE, NOT_CONVERGED, choice, console, facts, shown
 from epigauge.cli._scenes import save_cloud
 from epigauge.cli._targets import check_folder
-from epigauge.cli.metric import camera_rows
+from epigauge.cli.metric import Camera, camera_rows
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.images.exif import exif_focal_px
 from epigauge.images.loading import thumbnail
@@ -69,14 +71,22 @@ def scene(
         Path, typer.Option("--output", "-o", help="Folder for everything; new, or empty.")
     ],
     cameras: Annotated[
-        str,
-        typer.Option(
-            help="one: the same camera took all; own: each photograph has its own; size: one "
-            "for all photographs of a size; auto: one if all have one size, else own."
+        CameraGroups,
+        choice(
+            CameraGroups,
+            "one: the same camera took all; own: each photograph has its own; size: one "
+            "for all photographs of a size; auto: one if all have one size, else own.",
         ),
     ] = "auto",
-    camera: Annotated[str, typer.Option(help="Camera model.")] = "SIMPLE_RADIAL",
-    pairs: Annotated[str, typer.Option(help="Pairs to match: all, sequential or ranked.")] = "all",
+    camera: Camera = "SIMPLE_RADIAL",
+    pairs: Annotated[
+        Pairing,
+        choice(
+            Pairing,
+            "Pairs to match; sequential: each with the next five; ranked: each with the twelve "
+            "that look most like it.",
+        ),
+    ] = "all",
     max_features: Annotated[int, typer.Option(help="Features of each photograph.")] = 5000,
     exif_focal: Annotated[
         bool,
@@ -106,8 +116,7 @@ def scene(
     do not match, of something flat, or by a camera that only turned. Then
     nothing is written.
     """
-    if cameras not in ("auto", "one", "own", "size"):
-        raise ArgumentError("--cameras", f"is {cameras!r:.60}", "auto, one, own or size")
+    as_choice("--cameras", cameras, get_args(CameraGroups))
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise ArgumentError("--output", f"exists: {shown(output)}", "a new or an empty folder")
     if exif_focal and _is_database(sources):
@@ -208,7 +217,11 @@ def _priors(focal: Array | None, groups: Indices, camera: str) -> list[eg.Intrin
 
 
 def _upgraded(
-    tracks: eg.Tracks, cameras: str, camera: str, focal: Array | None, workers: int
+    tracks: eg.Tracks,
+    cameras: CameraGroups,
+    camera: UpgradeModel,
+    focal: Array | None,
+    workers: int,
 ) -> eg.MetricUpgrade:
     """Return the metric scene; with "auto", of own cameras where one does not fit."""
     sizes = np.asarray(tracks.sizes)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._arguments import as_count, as_positive
+from epigauge._options import Detector, Pairing
 from epigauge.errors import ArgumentError, FileFormatError
 from epigauge.images.loading import Image, load_image, opencv
 from epigauge.images.matching import features, seeker
@@ -171,8 +172,8 @@ class PairwiseMatches:
 def match_photographs(
     images: Sequence[PathLike],
     *,
-    pairs: str | Iterable[tuple[int, int]] = "all",
-    detector: str = "sift",
+    pairs: Pairing | Iterable[tuple[int, int]] = "all",
+    detector: Detector = "sift",
     ratio: float = 0.8,
     max_size: int = 2400,
     max_features: int = 8000,

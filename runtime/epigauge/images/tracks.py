@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge._arguments import as_count
+from epigauge._options import Pairing
 from epigauge.errors import ArgumentError
 from epigauge.images.pairwise import PairwiseMatches, match_photographs
 from epigauge.io._common import PathLike
@@ -83,7 +84,7 @@ class TrackSource:
 def build_tracks(
     images: Sequence[PathLike] | PairwiseMatches | PathLike,
     *,
-    pairs: str | Iterable[tuple[int, int]] = "all",
+    pairs: Pairing | Iterable[tuple[int, int]] = "all",
     cache: PathLike | None = None,
     min_inliers: int = _LEAST,
     seed: int = 0,

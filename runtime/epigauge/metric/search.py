@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from epigauge import kernels
+from epigauge._options import UpgradeModel
 from epigauge.bundle.prior_kinds import IntrinsicPrior
 from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
@@ -29,7 +30,7 @@ __all__ = ["MODELS", "Candidate", "Fit", "Search", "metric_of"]
 Array = NDArray[np.float64]
 
 #: Models that begin as cameras without distortion, which the metric basis is for.
-MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+MODELS = get_args(UpgradeModel)
 
 #: Metric bases that are adjusted at most.
 _CANDIDATES = 3

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
 from epigauge._arguments import as_count
+from epigauge._options import UpgradeModel
 from epigauge.bundle.prior_kinds import IntrinsicPrior
 from epigauge.cameras import MetricReconstruction
 from epigauge.errors import ArgumentError
@@ -42,7 +43,7 @@ def metric_upgrade(
     *,
     image_size: ArrayLike,
     shared: bool | ArrayLike = True,
-    camera: str = "SIMPLE_RADIAL",
+    camera: UpgradeModel = "SIMPLE_RADIAL",
     priors: Iterable[IntrinsicPrior] | None = None,
     workers: int = 1,
     backend: str | None = None,
