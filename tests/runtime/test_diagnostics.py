@@ -7,6 +7,7 @@ from dataclasses import replace
 import epigauge as eg
 import numpy as np
 import pytest
+from epigauge.kernels import available
 from epigauge.two_view import diagnostics, minima
 from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.diagnostics import (
@@ -274,7 +275,7 @@ def test_a_run_that_did_not_begin_has_flags(evidences) -> None:
 @pytest.mark.parametrize("reach", [40.0, 80.0, 160.0])
 def test_wrong_matches_near_their_own_place_are_no_geometry(m, reach) -> None:
     """Small motions in any direction agree with every F that is nearly that of no motion."""
-    for seed in range(3):
+    for seed in range(3 if available()["c"] is None else 1):  # searches in NumPy take seconds
         rng = np.random.default_rng([m, seed])
         x1 = rng.uniform([0.0, 0.0], [1600.0, 1200.0], (m, 2))
         far, angle = reach * np.sqrt(rng.random(m)), rng.uniform(0.0, 2.0 * np.pi, m)
