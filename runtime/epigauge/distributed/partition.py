@@ -85,9 +85,10 @@ class Partition:
 
     # ---------------------------------------------------------------- points that stay here
 
-    def load(self, token: int, cameras: Array, points: Array) -> None:
+    def load(self, token: int, cameras: Array, points: Array) -> tuple[Terms, None]:
         """Take the points of a state from outside."""
         self.states[token] = _State(cameras, points)
+        return (), None
 
     def linearize_state(self, token: int, lam: float, direct: bool) -> tuple[Terms, Arrays]:
         """Linearise at a state; return the sums of cameras, and what is largest.

@@ -220,6 +220,8 @@ class ResidentProblem(BundleProblem):
         own, held = self._own, self.held
         if not isinstance(estimate, ResidentEstimate):
             token = held.begin(estimate.cameras, estimate.points)
+            # Points alone: recipes would take all observations along.
+            own.run.each("load", (token, estimate.cameras), own.own(estimate.points))
         else:
             token = estimate.token
         lam, held.expected = held.expected, 0.0

@@ -137,7 +137,7 @@ def serve(
                 return None
             recipe.restore(partition, common[0])
         does = partition
-        if isinstance(partition, Partition) and call not in _AT_STATE:
+        if isinstance(partition, Partition) and call not in (*_AT_STATE, "load"):
             does = partition.evaluation
         found: tuple[Terms, Any] = getattr(does, call)(*common, *payload.own.get(number, ()))
         if payload.limit is not None and _held(run) > payload.limit:
