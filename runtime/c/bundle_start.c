@@ -265,7 +265,7 @@ int eg_resect(ptrdiff_t count, const double *q, const double *Q, double scale2, 
         eg_moments(BATCH, r.points + 4 * begin, r.moments + 16 * begin);
     one_camera own = {.r = &r, .P = P};
     const eg_lm_problem problem = {&own, 0.0, cost_at_start, linearize, make_step, cost_at_trial,
-                                   accept, NULL};
+                                   accept, NULL, 0};
     const eg_lm_options how = {ftol, 1e-12, 1e-14, 1e-3, 1e-8, 1, (int)max_iter};
     eg_lm_outcome outcome;
     eg_lm(&problem, &how, NULL, &outcome);

@@ -4,48 +4,7 @@
 #include <string.h>
 
 #include "bundle.h"
-
-/* P A = L U of a 4x4 matrix in its place, rows exchanged by their numbers; returns 1 if it is singular. */
-static int factor(double *A, int *rows)
-{
-    for (int k = 0; k < 4; ++k) {
-        int best = k;
-        for (int i = k + 1; i < 4; ++i)
-            if (fabs(A[4 * i + k]) > fabs(A[4 * best + k]))
-                best = i;
-        rows[k] = best;
-        if (A[4 * best + k] == 0.0)
-            return 1;
-        for (int j = 0; j < 4 && best != k; ++j) {
-            const double other = A[4 * k + j];
-            A[4 * k + j] = A[4 * best + j];
-            A[4 * best + j] = other;
-        }
-        for (int i = k + 1; i < 4; ++i) {
-            A[4 * i + k] /= A[4 * k + k];
-            for (int j = k + 1; j < 4; ++j)
-                A[4 * i + j] -= A[4 * i + k] * A[4 * k + j];
-        }
-    }
-    return 0;
-}
-
-static void solve(const double *A, const int *rows, double *x)
-{
-    for (int k = 0; k < 4; ++k) {
-        const double other = x[k];
-        x[k] = x[rows[k]];
-        x[rows[k]] = other;
-    }
-    for (int i = 1; i < 4; ++i)
-        for (int j = 0; j < i; ++j)
-            x[i] -= A[4 * i + j] * x[j];
-    for (int i = 3; i >= 0; --i) {
-        for (int j = i + 1; j < 4; ++j)
-            x[i] -= A[4 * i + j] * x[j];
-        x[i] /= A[4 * i + i];
-    }
-}
+#include "small.h"
 
 /* Multiply by the scale, which is found first where vectors are to have unit norm. */
 static void scaled(int size, int fit, double *scale, double *x)
@@ -68,7 +27,7 @@ int eg_change_basis(ptrdiff_t n, ptrdiff_t m, const double *T, int fit, double *
     double A[16];
     int rows[4];
     memcpy(A, T, sizeof A);
-    if (factor(A, rows))
+    if (eg_lu(4, A, rows))
         return 1;
     for (ptrdiff_t i = 0; i < n; ++i) {
         const double *from = P + 12 * i;
@@ -81,7 +40,7 @@ int eg_change_basis(ptrdiff_t n, ptrdiff_t m, const double *T, int fit, double *
     }
     memcpy(moved_Q, Q, (size_t)(4 * m) * sizeof(double));
     for (ptrdiff_t j = 0; j < m; ++j) {
-        solve(A, rows, moved_Q + 4 * j);
+        eg_lu_solve(4, A, rows, moved_Q + 4 * j);
         scaled(4, fit, alpha + j, moved_Q + 4 * j);
     }
     return 0;

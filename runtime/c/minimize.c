@@ -316,7 +316,7 @@ void eg_minimize(eg_matches *matches, const eg_options *options, const eg_chart 
     minimization own = {matches, options, chart, motion, {0.0}, {0.0}, outcome};
     /* Rounding of coordinates of size ~2 moves a distance by ~1e-15, as in eliminated.py. */
     const eg_lm_problem problem = {&own, 0.5 * total * 1e-30, cost_at_start, linearized, step_of,
-                                   cost_at_trial, accept};
+                                   cost_at_trial, accept, NULL, 0};
     const eg_lm_options how = {options->ftol, options->xtol, options->gtol, LAM_START, LAM_FLOOR,
                                !options->scaled, options->max_iter};
     eg_lm_outcome found;
