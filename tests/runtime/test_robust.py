@@ -489,11 +489,38 @@ def test_what_moved_on_its_own_does_not_bend_a_sharp_geometry(seed):
 
 def test_normal_distances_have_no_wrong_ones_about_them():
     # Nothing is gained by a core and what is around it: the noise stays that of all.
-    for seed in range(2):
-        _, x1, x2, right = spoilt(60, noise_px=3.0, seed=seed)
-        result = eg.estimate_fundamental(x1, x2)
-        assert result.noise_px == pytest.approx(3.0, rel=0.3)
-        assert np.mean(result.inlier[right]) > 0.9
+    for noise_px, m, wrong in ((3.0, 200, 60), (1.0, 80, 0)):
+        for seed in range(6):
+            _, x1, x2, right = spoilt(wrong, m=m, noise_px=noise_px, seed=seed)
+            result = eg.estimate_fundamental(x1, x2)
+            assert result.noise_px == pytest.approx(noise_px, rel=0.3)
+            assert np.mean(result.inlier[right]) > 0.9
+
+
+@pytest.mark.parametrize("seed", [1, 3, 7])
+def test_a_third_that_is_sharp_counts_among_matches_all_about_it(seed):
+    scene = eg.two_view_scene(n_points=200, distance=4.0, noise_px=0.3, seed=seed)
+    x2 = scene.x2.copy()
+    x2[60:] += np.random.default_rng(seed).uniform(-30.0, 30.0, (140, 2))
+    result = eg.estimate_fundamental(scene.x1, x2)
+    assert result.success
+    assert result.noise_px == pytest.approx(0.35, abs=0.15)
+    assert error(result.F, scene) < 0.3
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_many_matches_of_a_few_points_do_not_decide(seed):
+    # An epipole at such a point agrees with all of its matches, and exactly.
+    scene = eg.two_view_scene(n_points=100, noise_px=0.3, seed=seed)
+    rng = np.random.default_rng(seed)
+    x2 = scene.x2.copy()
+    few = rng.uniform(x2.min(axis=0), x2.max(axis=0), (8, 2))
+    x2[40:] = few[rng.integers(8, size=60)]
+    there, back = eg.estimate_fundamental(scene.x1, x2), eg.estimate_fundamental(x2, scene.x1)
+    for result, F in ((there, there.F), (back, back.F.T)):
+        assert result.success
+        assert error(F, scene) < 0.5
+        assert np.mean(result.inlier[:40]) > 0.9
 
 
 @pytest.mark.parametrize("about", [(0.0, 1.0), (0.2, 0.4)])

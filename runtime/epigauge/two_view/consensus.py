@@ -54,7 +54,7 @@ _HALO = 6.0
 #: They are believed where that gains so much of the logarithm of the likelihood, what is left is
 #: sharper by a factor, and a good part of those about: a few of many normal distances always are
 #: sharp.
-_WORTH, _SHARPER, _PART = 5.0, 0.5, 0.5
+_WORTH, _SHARPER, _PART = 5.0, 0.5, 0.25
 
 #: The share of right matches stays inside these.
 _SHARES = (0.02, 0.999)

@@ -3,6 +3,9 @@
 Detectors list a point several times (SIFT once for each of its orientations), and so a match.
 Copies would count as independent measurements: the noise would come out too small, and with it
 everything that is judged by it.
+
+Different matches of one point contradict each other: one of them is right at most. An epipole there
+agrees with all of them exactly, so they must not decide what most matches agree on.
 """
 
 from __future__ import annotations
@@ -17,9 +20,12 @@ from numpy.typing import NDArray
 from epigauge._library import address, library
 from epigauge.errors import BackendError
 
-__all__ = ["counted_once", "earliest"]
+__all__ = ["contradicted", "counted_once", "earliest"]
 
 Array = NDArray[np.float64]
+
+#: A point with no more matches may be two features side by side.
+_SEVERAL = 3
 
 
 @cache
@@ -94,3 +100,23 @@ def counted_once(
     np.maximum.at(once, first[copy], once[copy])
     once[copy] = 0.0
     return once
+
+
+def contradicted(x1: Array, x2: Array) -> NDArray[np.bool_]:
+    """Return which matches share a point of either image with several others.
+
+    Parameters
+    ----------
+    x1, x2 : ndarray, shape (m, 2)
+        Different matches.
+
+    Returns
+    -------
+    ndarray of bool, shape (m,)
+        Those of a point with more than three matches.
+    """
+    several = np.zeros(len(x1), np.bool_)
+    for x in (x1, x2):
+        _, place, counts = np.unique(x @ [1.0, 1.0j], return_inverse=True, return_counts=True)
+        several |= counts[place] > _SEVERAL
+    return several

@@ -22,7 +22,7 @@ from epigauge.two_view.chance import chance_agreement
 from epigauge.two_view.conditioning import Conditioning, condition
 from epigauge.two_view.confidence import Confidence, Signs, probability_below
 from epigauge.two_view.consensus import RANGE, WIDEST, Agreement, Consensus
-from epigauge.two_view.copies import earliest
+from epigauge.two_view.copies import contradicted, earliest
 from epigauge.two_view.covariance import untruncated
 from epigauge.two_view.essential_consensus import EssentialConsensus
 from epigauge.two_view.evidence import Evidence
@@ -42,6 +42,9 @@ Mask = NDArray[np.bool_]
 _DEVIATIONS = 3.0
 
 _ROUNDS = 20
+
+#: So many matches that do not contradict each other are searched without the others.
+_ENOUGH = 14
 
 #: Options of `refine_fundamental` with one entry a match.
 _PER_MATCH = {"weights": 1, "covariance1": 3, "covariance2": 3}
@@ -199,7 +202,8 @@ def estimate_fundamental(
     of the wrong matches may then be normal, too, but wide, where that leaves right ones which are
     at least twice as sharp. An F that most agree with sharply, no plane's alone and no accident,
     counts more than one that nearly all agree with, but bluntly.
-    Matches that violate the oriented epipolar constraint count as wrong.
+    Matches that violate the oriented epipolar constraint count as wrong. Those of a point with more
+    than three do not take part in the search: an epipole there agrees with all of them.
 
     Windows of a facade that are taken for others of their row agree with an F of their own, whose
     epipole is the vanishing point of the row: more of them than there are matches off the wall. But
@@ -251,19 +255,23 @@ def estimated(
     options.setdefault("noise_px", None)
     raw = _Raw.of(x1, x2, options, least)
 
-    consensus, frame = raw.consensus, raw.frame
+    frame = raw.frame
     given = None if threshold is None else threshold / frame.scale
+    agreed = raw.agreeing()
+    consensus = agreed.consensus
     if len(raw.rows) >= 8:
-        promise = promise if promise is None else promise[raw.rows]
+        promise = promise if promise is None else promise[agreed.rows]
         name, agreement = start(consensus, raw.table, front_end, given, promise, seed)
     if calibration is not None:
         maps = zip(frame.maps_from_pixels(), calibration, strict=True)
         cameras = (to_units @ K for to_units, K in maps)
-        consensus = EssentialConsensus(raw.table, *raw.q, *cameras)
-        raw = replace(raw, consensus=consensus)
+        consensus = EssentialConsensus(raw.table, *agreed.q, *cameras)
         if len(raw.rows) < 8:
             name, agreement = "5point", consensus.of_few()
         agreement = consensus.search([agreement], np.random.default_rng(seed))
+    if agreed is not raw:
+        density = agreement.sigma, agreement.share, agreement.extent, agreement.about
+        agreement = raw.consensus.judge(agreement.F, *density)
 
     fit = _fitted(raw, agreement, given, options)
     known = {
@@ -335,6 +343,15 @@ class _Raw:
         q = frame.forward(x1, x2)
         consensus = Consensus(table, *q)
         return _Raw(m, rows, copies, x1, x2, table, frame, q, consensus, least)
+
+    def agreeing(self) -> _Raw:
+        """Return the matches that do not contradict each other, if they are enough to search."""
+        kept = ~contradicted(self.x1, self.x2)
+        if np.all(kept) or np.count_nonzero(kept) < _ENOUGH:
+            return self
+        q1, q2 = (np.ascontiguousarray(q[:, kept]) for q in self.q)
+        some = {"rows": self.rows[kept], "x1": self.x1[kept], "x2": self.x2[kept], "q": (q1, q2)}
+        return replace(self, consensus=Consensus(self.table, q1, q2), **some)
 
 
 class _Fit(NamedTuple):
