@@ -43,7 +43,7 @@ def normals(H: Array) -> Array:
     H stretches nothing in the plane through the camera that is parallel to that of the points. With
     the singular values s1 >= s2 = 1 >= s3 and right singular vectors v1, v2, v3 of H, there are two
     such planes, of v2 and ``sqrt(1 - s3^2) v1 +- sqrt(s1^2 - 1) v3``. Zero where the camera only
-    turned.
+    turned. Proved in tests/derive/test_plane_motions.py.
     """
     _, s, Vt = np.linalg.svd(H)
     s = s / max(s[1], np.finfo(float).tiny)
