@@ -1,10 +1,11 @@
 """How often `estimate_two_view` names the right model: a table by scene, number and wrong matches.
 
     python benchmarks/models.py [--trials 100] [--matches 20 50 200 2000] [--calibrated]
-        [--scenes random still rotation planar general] [--processes 2]
+        [--scenes random still rotation planar general] [--processes 2] [--heavy]
 
-Scenes are those of verdicts.py: a noise of half a pixel, wrong matches uniform over the image. The
-last columns are the shares of the trials that end in each model, and their processor time. Then for
+Scenes are those of verdicts.py: a noise of half a pixel, wrong matches uniform over the image. With
+--heavy the noise is a tenth of a pixel, and Cauchy's of one along y of the second image. The last
+columns are the shares of the trials that end in each model, and their processor time. Then for
 each scene the share that is right, in all its rows and in the worst.
 """
 
@@ -32,10 +33,13 @@ RIGHT = {
 K = np.array([[_FOCAL, 0.0, _SIZE[0] / 2.0], [0.0, _FOCAL, _SIZE[1] / 2.0], [0.0, 0.0, 1.0]])
 
 
-def trial(kind: str, m: int, wrong: float, seed: int, calibrated: bool) -> tuple[str, float]:
+def trial(
+    kind: str, m: int, wrong: float, seed: int, calibrated: bool, heavy: bool
+) -> tuple[str, float]:
     """Return the model that one scene is given, and the seconds that took."""
     rng = np.random.default_rng([17, list(RIGHT).index(kind), m, round(100 * wrong), seed])
-    x1, x2 = scene(kind, m, wrong, rng)
+    x1, x2 = scene(kind, m, wrong, rng, 0.1 if heavy else 0.5)
+    x2[:, 1] += heavy * rng.standard_cauchy(m)
     begun = time.process_time()
     model = eg.estimate_two_view(x1, x2, *((K, K) if calibrated else (None, None))).model
     return model, time.process_time() - begun
@@ -48,6 +52,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="*", choices=RIGHT, default=list(RIGHT))
     parser.add_argument("--calibrated", action="store_true")
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--heavy", action="store_true")
     arguments = parser.parse_args()
     names = ["nothing", "still", "rotation", "plane", "E" if arguments.calibrated else "F"]
     head = ["scene", "matches", "wrong", "right", *names, "ms"]
@@ -56,7 +61,8 @@ def main() -> None:
     with ProcessPoolExecutor(arguments.processes) as pool:
         for kind, m in itertools.product(arguments.scenes, arguments.matches):
             for wrong in (0.0,) if kind == "random" else (0.0, 0.3, 0.6):
-                call = partial(trial, kind, m, wrong, calibrated=arguments.calibrated)
+                options = {"calibrated": arguments.calibrated, "heavy": arguments.heavy}
+                call = partial(trial, kind, m, wrong, **options)
                 models, seconds = zip(*pool.map(call, range(arguments.trials)), strict=True)
                 share = {name: models.count(name) / arguments.trials for name in names}
                 told[kind].append(sum(share.get(name, 0.0) for name in RIGHT[kind]))

@@ -50,8 +50,10 @@ _SIZE = np.array([1280.0, 960.0])
 _FOCAL = 1000.0
 
 
-def scene(kind: str, m: int, wrong: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return m matches with a noise of half a pixel, a share of them replaced by random ones."""
+def scene(
+    kind: str, m: int, wrong: float, rng: np.random.Generator, noise_px: float = 0.5
+) -> tuple[Array, Array]:
+    """Return m matches with noise, a share of them replaced by random ones."""
     rays = np.column_stack([rng.uniform(-0.6, 0.6, m), rng.uniform(-0.45, 0.45, m), np.ones(m)])
     X = rays * rng.uniform(4.0, 8.0, m)[:, None]
     if kind in ("planar", "near-planar"):
@@ -66,7 +68,7 @@ def scene(kind: str, m: int, wrong: float, rng: np.random.Generator) -> tuple[Ar
     t = rng.standard_normal(3)
     t *= 0.0 if kind in ("rotation", "still") else 0.8 / np.linalg.norm(t)
     x1, x2 = (_FOCAL * Y[:, :2] / Y[:, 2:] + _SIZE / 2.0 for Y in (X, X @ R.T + t))
-    x1, x2 = (x + 0.5 * rng.standard_normal((m, 2)) for x in (x1, x2))
+    x1, x2 = (x + noise_px * rng.standard_normal((m, 2)) for x in (x1, x2))
     chosen = rng.permutation(m)[: m if kind == "random" else round(wrong * m)]
     for x in (x1, x2):
         x[chosen] = rng.uniform([0.0, 0.0], _SIZE, (len(chosen), 2))

@@ -15,7 +15,7 @@ enum { PAIR_FRAME = 31, PAIR_MOTION = 36, PAIR_CONDITIONED = 55, PAIR_NORMAL = 6
 
 /* Numbers of a pair, as `quick.Facts` has them. */
 enum { COUNT = 0, SQUARES, EXTENT, LEAST, UNORIENTED, MEDIAN, TAIL, FOURTH, AFFINE, ON_PLANE,
-       PLANE, CHANCE, NEAR, REPEATED, PLACES, FACTS };
+       PLANE, CHANCE, NEAR, REPEATED, PLACES, LITTLE, FACTS };
 
 typedef struct {
     ptrdiff_t n;
@@ -237,10 +237,10 @@ static double places_off(const scratch_t *s, const pool_t *p, const double *v, d
     return (double)found;
 }
 
-/* The share of the matches that the best of some planes through three of them explains, and in how
-   many places the others are. */
-static double on_plane(scratch_t *s, const double *motion, const double *F, double noise,
-                       const eg_quick_options *options, double *places)
+/* The share of the matches that the best of some planes through three of them explains, in how many
+   places the others are, and which share has next to no relief, whatever the noise. */
+static void on_plane(scratch_t *s, const double *motion, const double *F, double noise,
+                     const eg_quick_options *options, double *facts)
 {
     const double e2[3] = {motion[2], motion[5], motion[8]};
     const double unit = sqrt(2.0) * noise; /* of a parallax, whose length both images share */
@@ -274,8 +274,9 @@ static double on_plane(scratch_t *s, const double *motion, const double *F, doub
     for (ptrdiff_t k = 0; k < options->grows; ++k)
         refit(&p, options->reach * unit, best);
     refit(&p, options->far * unit, best);
-    *places = places_off(s, &p, best, options->far * unit, options->beside);
-    return count_on(&p, best, options->far * unit) / (double)size;
+    facts[PLACES] = places_off(s, &p, best, options->far * unit, options->beside);
+    facts[ON_PLANE] = count_on(&p, best, options->far * unit) / (double)size;
+    facts[LITTLE] = count_on(&p, best, sqrt(2.0) * options->little) / (double)size;
 }
 
 /* The eigenvector of the least eigenvalue, near the one given, by inverse iteration. */
@@ -408,6 +409,7 @@ static void judge(scratch_t *s, const double *result, const eg_quick_options *op
     facts[UNORIENTED] = unoriented(s, motion, F, options->within * noise);
     facts[AFFINE] = affine(s);
     facts[CHANCE] = facts[ON_PLANE] = facts[NEAR] = facts[REPEATED] = facts[PLACES] = 0.0;
+    facts[LITTLE] = 0.0;
     facts[PLANE] = INFINITY;
     if (noise > options->wide) {
         for (ptrdiff_t i = 0; i < n; ++i)
@@ -418,7 +420,7 @@ static void judge(scratch_t *s, const double *result, const eg_quick_options *op
     if (noise > options->hidden)
         facts[PLANE] = plane(s);
     else
-        facts[ON_PLANE] = on_plane(s, motion, F, noise, options, facts + PLACES);
+        on_plane(s, motion, F, noise, options, facts);
 }
 
 /* facts (n, FACTS) of refined pairs: x1, x2, weights and distances as for eg_refine_pairs, with its

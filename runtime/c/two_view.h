@@ -98,6 +98,7 @@ typedef struct {
     ptrdiff_t grows;         /* fits to those that are on the best plane, as it grows */
     ptrdiff_t pairs, rank;   /* wrong pairs, and how many must be near */
     double beside;           /* what is in one place */
+    double little;           /* distance off a plane that is no relief */
     ptrdiff_t searched;      /* whether F itself chose these among raw matches */
 } eg_quick_options;
 

@@ -20,6 +20,7 @@ from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.essential import Calibrated
 from epigauge.two_view.evidence import ROUNDING, Evidence
 from epigauge.two_view.homography import fit_homography, plane_squares
+from epigauge.two_view.line_noise import is_noise, with_that_noise
 from epigauge.two_view.plane_motions import leaves_two_motions
 from epigauge.two_view.planes import (
     EPIPOLE,
@@ -30,7 +31,7 @@ from epigauge.two_view.planes import (
     displacement,
     is_plain_relief,
     judge_plane,
-    share_on_a_plane,
+    on_a_plane,
 )
 from epigauge.two_view.rotation import may_be_rotation
 from epigauge.two_view.suspicion import WIDE, agreeing, is_common, is_inflated, is_suspicious
@@ -232,9 +233,15 @@ def plane_flags(found: Evidence, *, tested: bool = False) -> dict[str, bool]:
     noise2 = max(found.noise, ROUNDING) ** 2
     hidden = found.noise > HIDDEN * RANGE
     everywhere = np.ones(len(found.weights), np.bool_)
-    off = is_plain_relief if found.searched else lambda own: share_on_a_plane(own) < MOST_ON
-    if not hidden and not tested and off(found):
-        return {"near-affine": _is_affine(found, everywhere)}
+    if not hidden:
+        plane = on_a_plane(found)
+        if is_noise(found, plane):
+            found = with_that_noise(found, plane)
+            noise2 = found.noise**2
+        elif not tested and (
+            is_plain_relief(found, plane) if found.searched else np.mean(plane.on) < MOST_ON
+        ):
+            return {"near-affine": _is_affine(found, everywhere)}
     model = judge_plane(found, hidden=hidden)
     on, weights = model.on, found.weights[model.on]
     bound = planar_bound(int(np.count_nonzero(on)), found.parameters) * noise2

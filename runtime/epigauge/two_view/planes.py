@@ -30,6 +30,7 @@ __all__ = [
     "HALF_ON",
     "HIDDEN",
     "MOST_ON",
+    "NO_RELIEF",
     "OFF_PLANE",
     "PLAINLY",
     "PLENTY",
@@ -37,12 +38,14 @@ __all__ = [
     "REACH",
     "RELIEF",
     "SAMPLES",
+    "OnPlane",
     "Planes",
     "affine_cost",
     "chance_pairs",
     "displacement",
     "is_plain_relief",
     "judge_plane",
+    "on_a_plane",
     "share_on_a_plane",
     "threes",
 ]
@@ -74,7 +77,7 @@ HIDDEN = RELIEF / 2.0**0.5
 
 #: Less than this share of the range, RMS, is no relief (1 px in an image of 1000), whatever the
 #: noise: that of photographs is not normal. Matches off by three times as much stand out.
-_NO_RELIEF = 0.001
+NO_RELIEF = 0.001
 _STANDS_OUT = 3.0
 
 #: A share of so many off the plane is not taken for relief: as many matches are wrong.
@@ -132,28 +135,48 @@ class Planes:
     cost: float
 
 
+@dataclass(frozen=True)
+class OnPlane:
+    """Some inliers, and how they lie to the best of some planes through three of them.
+
+    Attributes
+    ----------
+    rows : ndarray of int, shape (k,)
+        The inliers.
+    off : ndarray, shape (k,)
+        Their distances from it along epipolar lines, as far as each image has a part in them;
+        zero of matches on an epipole, which say nothing.
+    on : ndarray of bool, shape (k,)
+        Which are on it.
+    """
+
+    rows: NDArray[np.intp]
+    off: Array
+    on: Mask
+
+
 def share_on_a_plane(found: Evidence) -> float:
     """Return which share of the inliers the best of some planes through three of them explains."""
-    return float(np.mean(on_a_plane(found)[1]))
+    return float(np.mean(on_a_plane(found).on))
 
 
-def is_plain_relief(found: Evidence) -> bool:
+def is_plain_relief(found: Evidence, plane: OnPlane) -> bool:
     """Tell by a cheap test that many inliers are off any plane, and no wrong ones by chance.
 
     Matches side by side count once. False says nothing.
     """
-    rows, on = on_a_plane(found)
-    q = np.concatenate([found.q1, found.q2])[:, rows[~on]]
+    on = plane.on
+    q = np.concatenate([found.q1, found.q2])[:, plane.rows[~on]]
     places = len(np.unique(np.round(q / (BESIDE * RANGE)), axis=1).T)
     if places < PLENTY or np.mean(on) >= HALF_ON:
         return False
-    limit, share = found.limit, len(rows) / found.q1.shape[1]
+    limit, share = found.limit, len(on) / found.q1.shape[1]
     chance = chance_agreement(found.table, found.F, found.all1, found.all2, limit)
     return bool(places > PLAINLY * share * chance * found.rejected)
 
 
-def on_a_plane(found: Evidence) -> tuple[NDArray[np.intp], Mask]:
-    """Return some inliers, and which of them are on the plane of `share_on_a_plane`."""
+def on_a_plane(found: Evidence) -> OnPlane:
+    """Return how some inliers lie to the plane of `share_on_a_plane`."""
     U = np.linalg.svd(found.F)[0]
     n, noise = found.q1.shape[1], max(found.noise, ROUNDING)
     step = -(-n // POOL)
@@ -167,25 +190,23 @@ def on_a_plane(found: Evidence) -> tuple[NDArray[np.intp], Mask]:
         area = ab[0] * ac[1] - ab[1] * ac[0]
         v = np.array([bk * ac[1] - ck * ab[1], ab[0] * ck - ac[0] * bk]) / area
         v = np.vstack([v, kappa[a] - v[0] * q[0, a] - v[1] * q[1, a]])
-        counts = np.sum(_on(v, q, kappa, gain, REACH * noise), axis=1)
+        counts = np.sum(np.abs(_off(v, q, kappa, gain)) <= REACH * noise, axis=1)
         counts[~np.isfinite(v).all(axis=0)] = 0
         best = v[:, [np.argmax(counts)]]
         for deviations in (REACH,) * GROWS + (FAR_OFF,):
-            on = _on(best, q, kappa, gain, deviations * noise)[0] & np.isfinite(gain)
+            on = (np.abs(_off(best, q, kappa, gain)[0]) <= deviations * noise) & np.isfinite(gain)
             rows = (q * gain)[:, on]
             A, b = rows @ rows.T, rows @ (gain * kappa)[on]
             if np.linalg.cond(A) < 1e12:
                 best = np.linalg.solve(A, b)[:, None]
-        on = _on(best, q, kappa, gain, FAR_OFF * noise)[0]
-    return np.arange(0, n, step), on
+        off = _off(best, q, kappa, gain)[0]
+    return OnPlane(np.arange(0, n, step), off, np.abs(off) <= FAR_OFF * noise)
 
 
-def _on(v: Array, q: Array, kappa: Array, gain: Array, bound: float) -> Mask:
-    """Return which matches are on planes v (3, k): off them by no more, in either image.
-
-    A match on an epipole is; it says nothing.
-    """
-    return np.asarray(~(np.abs(gain * (kappa - v.T @ q)) > np.sqrt(2.0) * bound))
+def _off(v: Array, q: Array, kappa: Array, gain: Array) -> Array:
+    """Return how far matches are off planes v (3, k) in either image, along epipolar lines."""
+    off = gain * (kappa - v.T @ q) / np.sqrt(2.0)
+    return np.asarray(np.where(np.isnan(off), 0.0, off))
 
 
 def threes(n: int) -> NDArray[np.intp]:
@@ -264,7 +285,7 @@ def _is_flat(found: Evidence, apart: Array) -> bool:
     A few are a fiftieth beyond the relief that a plane may have, side by side counted once, and any
     number that agrees by chance: as many are wrong among matches that were checked.
     """
-    bound = (_NO_RELIEF * RANGE) ** 2
+    bound = (NO_RELIEF * RANGE) ** 2
     squares = found.all_weights * apart
     off = squares > _STANDS_OUT**2 * bound
     on = found.inlier & ~off

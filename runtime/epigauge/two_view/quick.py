@@ -41,6 +41,7 @@ from epigauge.two_view.planes import (
     HALF_ON,
     HIDDEN,
     MOST_ON,
+    NO_RELIEF,
     PLAINLY,
     PLENTY,
     POOL,
@@ -94,6 +95,8 @@ class Facts(NamedTuple):
         how many points of an image are there more than once.
     places : float
         In how many places matches are off the plane of `on_plane`.
+    little : float
+        The share of the matches that are off it by no relief, whatever the noise.
     """
 
     number: float
@@ -111,6 +114,7 @@ class Facts(NamedTuple):
     near: float
     repeated: float
     places: float
+    little: float
 
 
 class _Options(ctypes.Structure):
@@ -118,6 +122,7 @@ class _Options(ctypes.Structure):
         *((name, ctypes.c_double) for name in ("within", "wide", "hidden", "tail", "reach", "far")),
         *((name, ctypes.c_ssize_t) for name in ("samples", "pool", "grows", "pairs", "rank")),
         ("beside", ctypes.c_double),
+        ("little", ctypes.c_double),
         ("searched", ctypes.c_ssize_t),
     )
 
@@ -135,7 +140,9 @@ _NUMBERS = (
     PAIRS,
     RANK,
 )
-_OPTIONS, _SEARCHED = (_Options(*_NUMBERS, BESIDE * RANGE, searched) for searched in (0, 1))
+_OPTIONS, _SEARCHED = (
+    _Options(*_NUMBERS, BESIDE * RANGE, NO_RELIEF * RANGE, searched) for searched in (0, 1)
+)
 
 
 @cache
@@ -241,9 +248,10 @@ def verdict_of_raw(
         return None, False
     judges = -(-n // -(-n // POOL))
     many = max(PLENTY - 1, PLAINLY * (judges / n) * wrong * (m - n))
-    if own.on_plane >= HALF_ON or own.places <= many:  # a plane may be all that they are on
+    flat = own.on_plane >= HALF_ON or own.places <= many  # a plane may be all that they are on
+    if flat or own.little >= HALF_ON:
         found = _evidence(pair, matches, own, unit, agreeing, limit_px)
-        about = {name for name, is_raised in plane_flags(found, tested=True).items() if is_raised}
+        about = {name for name, is_raised in plane_flags(found, tested=flat).items() if is_raised}
         raised = ordered(about.union({"weak geometry"}.intersection(raised)))
     return raised, int(pair.numbers[0, 4]) > 0 and verdicts.usable(raised, "F")
 
@@ -343,7 +351,7 @@ def flags(own: Facts, scale: float) -> tuple[str, ...] | None:
             return None
         if own.plane <= bound:
             return ordered({"weak geometry", *found})
-    elif own.on_plane >= MOST_ON:
+    elif own.on_plane >= MOST_ON or own.little >= HALF_ON:
         return None
     return found
 
