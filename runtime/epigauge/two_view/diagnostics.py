@@ -129,7 +129,9 @@ def diagnose(found: Evidence, deviation: float, ambiguous: bool) -> tuple[str, .
     - nearly planar: of the matches that agree with F at most a tenth, and fewer than 30, are more
       than 8 s from the homography that most are on, the others by one per cent of the range at
       most, RMS; at most a quarter where all are within half a per cent, RMS. Such a scene
-      is planar where all are within a thousandth, RMS, but for those that agree by chance;
+      is planar where all are within a thousandth, RMS, but for those that agree by chance.
+      Distances off a plane along the epipolar lines count as noise, where half are within a
+      thousandth, neighbours are not off alike, and large ones are to both sides (`line_noise`);
     - still camera: planar, and ``S_I - S_H <= max(8 F99, 0.1 n) s_H^2``, F99 being the quantile
       for 8 and 2 n - 8 degrees of freedom and ``s_H^2 = S_H / (2 n - 8)`` the noise, since F fits a
       plane too well; in place of the former;

@@ -350,8 +350,14 @@ class _Raw:
         if np.all(kept) or np.count_nonzero(kept) < _ENOUGH:
             return self
         q1, q2 = (np.ascontiguousarray(q[:, kept]) for q in self.q)
-        some = {"rows": self.rows[kept], "x1": self.x1[kept], "x2": self.x2[kept], "q": (q1, q2)}
-        return replace(self, consensus=Consensus(self.table, q1, q2), **some)
+        return replace(
+            self,
+            rows=self.rows[kept],
+            x1=self.x1[kept],
+            x2=self.x2[kept],
+            q=(q1, q2),
+            consensus=Consensus(self.table, q1, q2),
+        )
 
 
 class _Fit(NamedTuple):
