@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import sqlite3
 from pathlib import Path
 
 import epigauge as eg
@@ -37,6 +39,18 @@ def test_a_database_becomes_a_scene(run, tmp_path: Path) -> None:
     code, _, err = run("scene", database, "-o", output)
     assert code == 2
     assert "empty" in err
+
+
+def test_names_with_blanks_are_kept_where_a_file_can_hold_them(run, tmp_path: Path) -> None:
+    database = Project(n_views=4, n_points=150).write(tmp_path / "database.db")
+    with contextlib.closing(sqlite3.connect(database)) as connection, connection:
+        connection.execute("UPDATE images SET name = 'IMG ' || name")
+    output = tmp_path / "scene"
+    code, _, err = run("scene", database, "-o", output)
+    assert code == 0, err
+    assert "sparse_text cannot hold 'IMG 1.jpg'" in " ".join(err.split())
+    assert not (output / "sparse_text").exists()
+    assert eg.load_scene(output / "sparse" / "0")[0].names[0] == "IMG 1.jpg"
 
 
 def _poster(folder: Path, seed: int) -> list[Path]:

@@ -272,6 +272,10 @@ class _Answer:
         lines += [f"Left out: {name} {why}." for name, why in self.source.left_out.items()]
         return lines
 
+    def _spaced(self) -> list[str]:
+        """Return names with white space, which readers of COLMAP's text take for their end."""
+        return [name for name in self.tracks.names or () if name.split() != [name]]
+
     def report(self, out: Console) -> None:
         """Tell people on stderr what came out."""
         result, tracks = self.result, self.tracks
@@ -294,7 +298,10 @@ class _Answer:
         for name, text in explained(result.flags).items():
             style = "bold yellow" if usable([name], "views") else "bold red"
             out.print(f"[{style}]{name}:[/] {escape(text)}", soft_wrap=True)
-        for name, why in self.source.left_out.items():
+        left_out = dict(self.source.left_out)
+        if result.success and self._spaced():
+            left_out["sparse_text"] = f"cannot hold {self._spaced()[0]!r}, with white space"
+        for name, why in left_out.items():
             out.print(f"[bold]left out:[/] {escape(name)} {escape(why)}", soft_wrap=True)
         if not result.success:
             reasons = [f"the photographs {_WHY[name]}" for name in result.flags if name in _WHY]
@@ -319,7 +326,8 @@ class _Answer:
         tracks, found = self.result.kept(self.tracks)
         (folder / "sparse").mkdir()
         save_scene(folder / "sparse" / "0", tracks, found)
-        save_scene(folder / "sparse_text", tracks, found, text=True)
+        if not self._spaced():
+            save_scene(folder / "sparse_text", tracks, found, text=True)
         note = "points in the colours of the photographs, cameras orange"
         save_cloud(folder / "points.ply", found.X, found.centres, note, tracks.colours)
         write_npz_scene(folder / "scene.npz", tracks, found, {})
