@@ -278,6 +278,8 @@ def main() -> int:
     parser.add_argument("--parts", action="store_true", help="a folder, by two workers")
     parser.add_argument("--memory-limit", type=int, metavar="MB", help="of each worker")
     options = parser.parse_args()
+    if options.steps < 2:
+        parser.error("--steps is less than two: the first one is left out")
     views = options.views or max(options.observations // 2000, 2 * _SEEN)
     print(f"\n{described(machine(('distributed',)))}\n")
     if options.parts:

@@ -83,7 +83,7 @@ def test_confidence() -> None:
 
 def test_cluster() -> None:
     pytest.importorskip("distributed")
-    printed = run("cluster.py", "--observations", 4000, "--steps", 1, "--rounds", 1)
+    printed = run("cluster.py", "--observations", 4000, "--steps", 2, "--rounds", 1)
     assert "| 2 workers |" in printed
-    printed = run("cluster.py", "--parts", "--observations", 4000, "--steps", 1)
+    printed = run("cluster.py", "--parts", "--observations", 4000, "--steps", 2)
     assert "peak memory" in printed

@@ -419,20 +419,22 @@ class TestThreads:
         assert max(by_pairs) < 3.0 * min(by_pairs)
         assert pairs[0][1] < passes[0][1]
 
-    def test_no_pass_outlives_the_call_that_waits_for_it(self) -> None:
+    def test_no_pass_outlives_the_call_that_waits_for_it(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(lanes, "_SHARE", 1.0)
         parts, _ = scene_of("projective", 6, 500, 0.5)
-        ended: list[int] = []
+        ended: list[slice] = []
 
-        def interrupted(k: int, *_: int) -> int:
-            if k == 0:
+        def interrupted(points: slice) -> None:
+            if points.start == 0:
                 raise KeyboardInterrupt
             time.sleep(0.2)
-            ended.append(k)
-            return 0
+            ended.append(points)
 
         with pytest.raises(KeyboardInterrupt):
-            both("projective", parts, 2)[0]._share([(0, 1), (1, 2)], interrupted)
-        assert ended == [1]
+            both("projective", parts, 2)[0].passes.over(500, interrupted)
+        assert ended == [slice(250, 500)]
 
     def test_threads_end_with_the_problem(self, scene: Any) -> None:
         before = set(threading.enumerate())

@@ -336,9 +336,9 @@ class TestVerdictWhenAsked:
         made, judged = [], []
         unjudged, told = eg.BundleResult.unjudged, results.told
 
-        def counted(judge: Any, **known: Any) -> eg.BundleResult:
+        def counted(*of: Any, **known: Any) -> eg.BundleResult:
             made.append(known)
-            return unjudged(judge, **known)
+            return unjudged(*of, **known)
 
         monkeypatch.setattr(eg.BundleResult, "unjudged", counted)
         monkeypatch.setattr(results, "told", lambda *of: judged.append(of) or told(*of))

@@ -307,7 +307,7 @@ def test_threads_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     parts = net.reference.model, net.reference.graph, net.reference.q, weights, Loss()
     columns = range(6)
     many = [NativeLinearizer(*parts, workers, columns) for workers in (1, 2, 5)]
-    assert len(many[2].edges[1]) == 6
+    assert len(many[2].passes.edges[1]) == 6
     found = [own.linearize(*net.at).coupling.marginals(T, blocks, True) for own in many]
     for own in found[1:]:
         for one, other in zip(found[0], own, strict=True):

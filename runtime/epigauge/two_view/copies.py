@@ -24,8 +24,8 @@ __all__ = ["contradicted", "counted_once", "earliest"]
 
 Array = NDArray[np.float64]
 
-#: A point with no more matches may be two features side by side.
-_SEVERAL = 3
+#: Matchers give a point no more of them, right ones among them.
+_SEVERAL = 5
 
 
 @cache
@@ -113,7 +113,7 @@ def contradicted(x1: Array, x2: Array) -> NDArray[np.bool_]:
     Returns
     -------
     ndarray of bool, shape (m,)
-        Those of a point with more than three matches.
+        Those of a point with more than five matches.
     """
     several = np.zeros(len(x1), np.bool_)
     for x in (x1, x2):

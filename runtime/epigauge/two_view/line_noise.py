@@ -30,8 +30,9 @@ _MEDIAN = 0.6745
 #: Fewer matches do not tell.
 _LEAST = 40
 
-#: What is off a plane is more than the noise across epipolar lines from so many times that.
-_MORE = 2.0
+#: What is off a plane may be noise of one axis if it is so many times that across epipolar lines:
+#: less is F's own freedom, or the small relief of a real scene, more is data without noise.
+_WORSE, _WORST = 6.0, 60.0
 
 #: Beyond so many times their median are distances that are large, and a tenth are beyond so many at
 #: most: 6.3 of Cauchy's distribution.
@@ -58,7 +59,8 @@ def is_noise(found: Evidence, plane: OnPlane) -> bool:
     off, size = plane.off, np.abs(plane.off)
     half = median(size)
     noise = max(found.noise, ROUNDING)
-    if len(off) < _LEAST or not _MORE * _MEDIAN * noise < half <= NO_RELIEF * RANGE:
+    worse = half / (_MEDIAN * noise)
+    if len(off) < _LEAST or half > NO_RELIEF * RANGE or not _WORSE < worse < _WORST:
         return False
     if np.quantile(size, 0.9) > _TENTH * half:
         return False

@@ -203,7 +203,7 @@ def estimate_fundamental(
     at least twice as sharp. An F that most agree with sharply, no plane's alone and no accident,
     counts more than one that nearly all agree with, but bluntly.
     Matches that violate the oriented epipolar constraint count as wrong. Those of a point with more
-    than three do not take part in the search: an epipole there agrees with all of them.
+    than five do not take part in the search: an epipole there agrees with all of them.
 
     Windows of a facade that are taken for others of their row agree with an F of their own, whose
     epipole is the vanishing point of the row: more of them than there are matches off the wall. But
