@@ -30,6 +30,9 @@ MIN_PX, MAX_PX = 1e-70, 1e70
 #: Binary exponent from which a matrix of free scale is rescaled, which is exact.
 _EXPONENT = 200
 
+#: Between these sums of squares nine numbers have no exponent of that size.
+_SQUARES = (2.0 ** (2 - 2 * _EXPONENT) * 9, 2.0 ** (2 * _EXPONENT - 2))
+
 
 def on_host(name: str, value: Any) -> Any:
     """Return a tensor of PyTorch or CuPy, or a nullable table of pandas, as an array.
@@ -126,6 +129,9 @@ def as_fundamental(F0: ArrayLike, name: str = "F0") -> Array:
     F = as_real(name, F0, "a (3, 3) matrix")
     if F.shape != (3, 3):
         raise ArgumentError(name, f"has shape {F.shape}", "a (3, 3) matrix")
+    # Neither NaN, infinite, zero nor to be rescaled: one number tells it of the usual ones.
+    if _SQUARES[0] < np.vdot(F, F) < _SQUARES[1]:
+        return F
     if not np.isfinite(F).all():
         row, column = np.argwhere(~np.isfinite(F))[0]
         raise ArgumentError(name, f"has {F[row, column]} at [{row}, {column}]", "finite entries")

@@ -54,6 +54,13 @@ def earliest(x1: Array, x2: Array, offsets: NDArray[np.intp] | None = None) -> N
     ndarray of intp, shape (m,)
         Rows of x1 and x2; its own row for a match that is no copy.
     """
+    return _counted(x1, x2, offsets)[0]
+
+
+def _counted(
+    x1: Array, x2: Array, offsets: NDArray[np.intp] | None
+) -> tuple[NDArray[np.intp], int]:
+    """Return the same and how many copies there are."""
     m = len(x1)
     bounds = np.array([0, m], np.intp) if offsets is None else offsets
     function = _function()
@@ -63,13 +70,13 @@ def earliest(x1: Array, x2: Array, offsets: NDArray[np.intp] | None = None) -> N
             rows = np.column_stack([x1[begin:end], x2[begin:end]]) + 0.0
             _, index, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
             first[begin:end] = begin + index[place.ravel()]
-        return first
-    copies = function(len(bounds) - 1, *map(address, (bounds, x1, x2, first)))
+        return first, int(np.count_nonzero(first != np.arange(m)))
+    copies = function(len(bounds) - 1, address(bounds), address(x1), address(x2), address(first))
     if copies < 0:
         raise MemoryError(f"no room for {m} matches")
     if offsets is not None:
         first += np.repeat(bounds[:-1], np.diff(bounds))
-    return first
+    return first, copies
 
 
 def counted_once(
@@ -92,10 +99,10 @@ def counted_once(
         The weights that were given where nothing is repeated. Else the earliest of equal matches
         has the largest of their weights, and the others have zero.
     """
-    first = earliest(x1, x2, offsets)
-    copy = first != np.arange(len(first))
-    if not copy.any():
+    first, copies = _counted(x1, x2, offsets)
+    if not copies:
         return weights
+    copy = first != np.arange(len(first))
     once = np.ones(len(first)) if weights is None else weights.copy()
     np.maximum.at(once, first[copy], once[copy])
     once[copy] = 0.0
