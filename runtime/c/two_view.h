@@ -88,6 +88,11 @@ void eg_minimize(eg_matches *matches, const eg_options *options, const eg_chart 
 EG_EXPORT ptrdiff_t eg_copies(ptrdiff_t pairs, const ptrdiff_t *offsets, const double *x1,
                               const double *x2, ptrdiff_t *first);
 
+/* Points on one line: collinear.c. */
+EG_EXPORT void eg_may_be_lines(ptrdiff_t pairs, const ptrdiff_t *offsets, const double *x1,
+                               const double *x2, const double *weights, const double *bound,
+                               double share, unsigned char *may);
+
 /* The numbers of the rules, as in the structure of quick.py. */
 typedef struct {
     double within;           /* standard deviations that count as within the noise */

@@ -7,6 +7,7 @@ from typing import Any
 import epigauge as eg
 import numpy as np
 import pytest
+from epigauge.kernels import available
 from epigauge.two_view.collinear import may_be_lines
 from numpy.typing import NDArray
 
@@ -91,6 +92,7 @@ def test_points_beside_a_line_that_agree_determine_it() -> None:
     assert eg.estimate_homography(x1, x2).success
 
 
+@pytest.mark.skipif(available()["c"] is not None, reason="needs the C library")
 def test_the_cheap_test_misses_no_line() -> None:
     rng = np.random.default_rng(8)
     sets = [line(9), rng.uniform(0.0, 1000.0, (2, 200, 2)), line(10, n=20, beside=3), line(11, n=2)]
@@ -100,3 +102,10 @@ def test_the_cheap_test_misses_no_line() -> None:
     assert may_be_lines(x1, x2, offsets, noise).tolist() == [False, True, False, True, False]
     mirrored = may_be_lines(rng.permutation(x1), x2, offsets, noise)
     assert mirrored[1]  # one image suffices
+    # Weights are squares of one over the noise of a match; none is on a line by a weight of zero.
+    heavier = may_be_lines(x1, x2, offsets, 1e3 * noise, np.full(len(x1), 1e6))
+    assert heavier.tolist() == [False, True, False, True, False]
+    assert not may_be_lines(x1, x2, offsets, noise, np.zeros(len(x1))).any()
+    # The same point again is no line.
+    twice = np.repeat(x1, 2, axis=0)
+    assert not may_be_lines(twice, twice, 2 * offsets, np.full(5, 1e-9)).any()

@@ -8,11 +8,15 @@ be fitted to.
 
 from __future__ import annotations
 
+import ctypes
 import math
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge._library import address, library
 from epigauge.kernels import Table
 from epigauge.two_view.chance import (
     SIGNIFICANT,
@@ -43,9 +47,6 @@ _REFITS = 3
 
 #: Points of single precision, as databases hold them, are rounded by so much, conditioned.
 _SINGLE = 1e-7
-
-#: A weight below this is none: the noise of a match is that of weight one over its root.
-_LIGHT = 1e-100
 
 #: Points next to one another in the list are on a line by so many times the noise; so many of such
 #: threes are where most points are on one, and seldom elsewhere.
@@ -107,11 +108,13 @@ def may_be_lines(
 ) -> Mask:
     """Tell by a cheap test of which pairs of images most points may be on one line.
 
+    Compiled, as all of the quick tests are; without the library all pairs are judged in full.
+
     Parameters
     ----------
-    x1, x2 : ndarray, shape (m, 2)
+    x1, x2 : ndarray, shape (m, 2), float64, contiguous
         Matches in pixels.
-    offsets : ndarray, shape (n + 1,)
+    offsets : ndarray of intp, shape (n + 1,)
         Pair k has the matches ``offsets[k]:offsets[k + 1]``.
     noise_px : ndarray, shape (n,)
         Standard deviation of a coordinate of weight one.
@@ -123,25 +126,19 @@ def may_be_lines(
     ndarray of bool, shape (n,)
         Those that `is_left_open` has to judge.
     """
-    counts, end = np.diff(offsets), offsets[1:]
-    if len(x1) < 3:
-        return np.zeros(len(counts), np.bool_)
-    z = np.stack([x1, x2]).view(np.complex128)[..., 0]
-    a, b = z[:, 1:-1] - z[:, :-2], z[:, 2:] - z[:, :-2]
-    area = np.abs((a * b.conj()).imag)
-    up_to = np.zeros((2, z.shape[1] + 1), np.intp)
-    bound = np.repeat(_NEAR * noise_px, counts)
-    if weights is not None:
-        # Matches of weight zero are on no line.
-        bound = np.where(weights > 0.0, bound / np.sqrt(np.maximum(weights, _LIGHT)), 0.0)
-    bound = bound[:-2]
-    near = np.zeros(z.shape, np.bool_)
-    near[:, :-2] = area <= bound * np.maximum(np.abs(a), np.abs(b))
-    near[:, :-2] &= (a != 0.0) & (b != 0.0) & (a != b)  # three points
-    near[:, end - 1] = near[:, end - 2] = False  # threes of two pairs
-    np.cumsum(near, axis=1, out=up_to[:, 1:])
-    many = up_to[:, end] - up_to[:, offsets[:-1]] > _THREES * np.maximum(counts - 2, 0)
-    return np.asarray(many.any(axis=0))
+    may = np.empty(len(offsets) - 1, np.bool_)
+    bound = np.asarray(_NEAR * noise_px, np.float64)
+    arrays = (offsets, x1, x2, weights, bound)
+    _function()(len(may), *map(address, arrays), _THREES, address(may))
+    return may
+
+
+@cache
+def _function() -> Any:
+    function = library().eg_may_be_lines
+    function.argtypes = [ctypes.c_ssize_t, *[ctypes.c_void_p] * 5, ctypes.c_double, ctypes.c_void_p]
+    function.restype = None
+    return function
 
 
 def _off_line(q: Array, noise: float) -> Mask | None:
