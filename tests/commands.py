@@ -182,8 +182,8 @@ def in_process(*words: str, stdin: bytes = b"") -> Run:
     return Run(list(words), done.exit_code, done.stdout_bytes, done.stderr + trace)
 
 
-def prepare(run: Runner) -> list[str]:
-    """Write the samples and what is made of them into the folder of the moment."""
+def prepare(run: Runner, scene: bool) -> list[str]:
+    """Write the samples and what is made of them, and bad files, into the folder of the moment."""
     import colmap_databases
     import epigauge as eg
 
@@ -196,7 +196,17 @@ def prepare(run: Runner) -> list[str]:
     matches = eg.load_matches("matches.csv")
     marks = np.arange(len(matches)) % 10 != 0
     np.savez("marked_matches.npz", x1=matches.x1, x2=matches.x2, inlier=marks)
-    return problems
+    Path("empty.csv").write_bytes(b"")
+    Path("words.csv").write_bytes(b"To be, or not to be\n" * 20)
+    Path("words.txt").write_bytes(b"that is the question\n" * 20)
+    Path("noise.npz").write_bytes(bytes(range(256)) * 9)
+    Path("a_folder").mkdir()
+    return problems + (alone(commands()["scene"], run) if scene else [])
+
+
+def alone(command: Command, run: Runner) -> list[str]:
+    """Return what is wrong with the shortest call that works."""
+    return run(*command.words()).check(0, 1)
 
 
 def from_the_corner() -> Any:
@@ -273,11 +283,6 @@ def choices(command: Command, run: Runner) -> Iterator[str]:
 
 def bad_inputs(command: Command, run: Runner, quick: bool = False) -> Iterator[str]:
     """Yield what is wrong where a file is missing, empty, a directory, or of another kind."""
-    Path("empty.csv").write_bytes(b"")
-    Path("words.csv").write_bytes(b"To be, or not to be\n" * 20)
-    Path("words.txt").write_bytes(b"that is the question\n" * 20)
-    Path("noise.npz").write_bytes(bytes(range(256)) * 9)
-    Path("a_folder").mkdir(exist_ok=True)
     files = ["missing.csv", "empty.csv", "a_folder"]
     if not quick:
         files += ["words.csv", "words.txt", "noise.npz", "A.jpg"]

@@ -16,17 +16,25 @@ wider than its screen.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import doctest
+import multiprocessing
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
 import venv
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import commands as cli
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 TESTS = CHECKOUT / "tests"
@@ -35,34 +43,75 @@ sys.path.insert(0, str(TESTS))
 #: Commands that take longer than the others, which choices and forms do not change much.
 SLOW = ("reproduce", "demo", "scene")
 
+#: Name of a part of the walk, what looks for faults, and its arguments.
+Part = tuple[str, Callable[..., Iterable[str]], tuple[Any, ...]]
 
-def walk(quick: bool, programs: bool = True) -> Iterator[tuple[str, list[str]]]:
-    """Yield the name of each part of the walk and what is wrong there."""
+
+def parts(quick: bool, programs: bool = True) -> Iterator[Part]:
+    """Yield the parts of the walk, each of which can run beside the others."""
+    import commands as cli
+    import documents
+
+    run = cli.program if programs else cli.in_process
+    yield "help", cli.help_of, (None, run)
+    for name, command in cli.commands().items():
+        yield f"{name} --help", cli.help_of, (command, run)
+        if quick and name in SLOW:
+            continue
+        if name != "scene":  # others read what it makes: `commands.prepare`
+            yield name, cli.alone, (command, run)
+        if not quick and name not in SLOW:
+            yield f"{name}: files", cli.written, (command, run)
+            yield f"{name}: choices", cli.choices, (command, run)
+    for name, command in cli.commands().items():
+        yield f"{name}: bad input", cli.bad_inputs, (command, run, quick)
+    yield "flags in the documentation", flags_in_pages, ()
+    yield "names in the documentation", names_in_pages, ()
+    yield "links in the documentation", links_in_pages, ()
+    if not quick:
+        for page in documents.pages():
+            yield page.relative_to(CHECKOUT).as_posix(), example, (page, run)
+        yield "docstrings", docstrings, ()
+
+
+def walk(
+    quick: bool, programs: bool = True, workers: int = 1
+) -> Iterator[tuple[str, list[str], float]]:
+    """Yield the name of each part of the walk, what is wrong there, and the seconds it took.
+
+    Each part works in a copy of the folder that `commands.prepare` fills.
+    """
     import commands as cli
 
     run = cli.program if programs else cli.in_process
-    yield "samples", cli.prepare(run)
-    found = cli.commands()
-    yield "help", cli.help_of(None, run)
-    # What the others read.
+    home = Path.cwd()
+    Path("samples").mkdir()
+    yield done_in(home / "samples", ("samples and scene", cli.prepare, (run, not quick)))
+    with contextlib.ExitStack() as stack:
+        found = list(parts(quick, programs))
+        folders = [home / f"part{k}" for k in range(len(found))]
+        if workers == 1:
+            yield from map(done_in, folders, found)
+        else:
+            spawn = multiprocessing.get_context("spawn")
+            pool = stack.enter_context(ProcessPoolExecutor(workers, spawn))
+            yield from pool.map(done_in, folders, found)
     if not quick:
-        yield "scene", run(*found["scene"].words()).check(0)
-    for name, command in found.items():
-        yield f"{name} --help", cli.help_of(command, run)
-        slow = name in SLOW
-        if name != "scene" and not (quick and slow):
-            yield name, run(*command.words()).check(0, 1)
-        if not quick:
-            yield f"{name}: files", list(cli.written(command, run)) if not slow else []
-            yield f"{name}: choices", list(cli.choices(command, run)) if not slow else []
-        yield f"{name}: bad input", list(cli.bad_inputs(command, run, quick))
-    yield "flags in the documentation", list(flags_in_pages())
-    yield "names in the documentation", list(names_in_pages())
-    yield "links in the documentation", list(links_in_pages())
-    if not quick:
-        yield from examples(programs)
-        yield "docstrings", list(docstrings())
-        yield "pages in a browser", list(in_browser(Path()))
+        yield done_in(home, ("pages in a browser", in_browser, (home,)))
+
+
+def done_in(folder: Path, part: Part) -> tuple[str, list[str], float]:
+    """Return the name of a part, what it finds in a copy of the samples, and its seconds."""
+    name, look, arguments = part
+    begin = time.perf_counter()
+    if not folder.exists():
+        shutil.copytree(folder.parent / "samples", folder)
+    with contextlib.chdir(folder):
+        try:
+            problems = list(look(*arguments))
+        except subprocess.TimeoutExpired as error:
+            problems = [str(error)]
+    return name, problems, time.perf_counter() - begin
 
 
 def sources() -> list[Path]:
@@ -115,30 +164,24 @@ def flags_in_pages() -> Iterator[str]:
                     yield f"{where}: there is no {word}"
 
 
-def examples(programs: bool) -> Iterator[tuple[str, list[str]]]:
-    """Run what the pages show, each page in a folder of its own."""
-    import commands as cli
+def example(page: Path, run: cli.Runner) -> Iterator[str]:
+    """Run what a page shows."""
     import documents
-
-    run = cli.program if programs else cli.in_process
 
     def run_command(arguments: list[str], where: str) -> None:
         problems = run(*arguments).check(0)
         assert not problems, f"{where}: {problems[0]}"
 
-    for page in documents.pages():
-        name = page.relative_to(CHECKOUT).as_posix()
-        with tempfile.TemporaryDirectory() as folder:
-            try:
-                documents.run(page, Path(folder), run_command)
-            except Exception as error:  # whatever a reader would meet
-                text = f"{type(error).__name__}: {error}"
-                if excused(error, page.read_text(encoding="utf-8")):
-                    yield f"{name}: skipped, as it says: {text}", []
-                else:
-                    yield name, [text[-1500:]]
-            else:
-                yield name, []
+    folder = Path("as a reader").resolve()
+    folder.mkdir()
+    try:
+        documents.run(page, folder, run_command)
+    except Exception as error:  # whatever a reader would meet
+        text = f"{type(error).__name__}: {error}"
+        if excused(error, page.read_text(encoding="utf-8")):
+            print(f"   {page.name} skips the rest, as it says: {text}", flush=True)
+        else:
+            yield text[-1500:]
 
 
 def excused(error: Exception, page: str) -> bool:
@@ -189,13 +232,11 @@ def in_browser(folder: Path) -> Iterator[str]:
                 )
 
 
-def report(parts: Iterable[tuple[str, list[str]]]) -> int:
+def report(parts: Iterable[tuple[str, list[str], float]]) -> int:
     """Print each part as it ends; return how much is wrong."""
-    count, begin = 0, time.perf_counter()
-    for name, problems in parts:
-        now = time.perf_counter()
-        print(f"{'ok' if not problems else 'WRONG':6} {now - begin:6.1f} s  {name}", flush=True)
-        begin = now
+    count = 0
+    for name, problems, seconds in parts:
+        print(f"{'ok' if not problems else 'WRONG':6} {seconds:6.1f} s  {name}", flush=True)
         for problem in problems:
             print("       " + problem.replace("\n", "\n       "), flush=True)
         count += len(problems)
@@ -226,17 +267,22 @@ def main() -> int:
     parser.add_argument(
         "--in-process", action="store_true", help="with --here: no process for each command"
     )
+    parser.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, help="parts that run side by side"
+    )
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="newcomer-") as folder:
         if not given.here:
             python = installed(given.wheel, Path(folder))
-            call = [str(python), __file__, "--here", *(["--quick"] if given.quick else [])]
+            call = [str(python), __file__, "--here", "--workers", str(given.workers)]
+            call += ["--quick"] if given.quick else []
             kept = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "EPIGAUGE"))}
             return subprocess.run(call, check=False, cwd=folder, env=kept).returncode
         import commands as cli
 
         with cli.bare(Path(folder)):
-            return 1 if report(walk(given.quick, not given.in_process)) else 0
+            done = walk(given.quick, not given.in_process, given.workers)
+            return 1 if report(done) else 0
 
 
 if __name__ == "__main__":

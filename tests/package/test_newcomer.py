@@ -5,11 +5,11 @@ from __future__ import annotations
 import importlib.util
 import re
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
 import documents
+import epigauge as eg
 import html_pages
 import pytest
 
@@ -32,17 +32,12 @@ def newcomer() -> ModuleType:
     return module
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    made = tmp_path_factory.mktemp("newcomer")
-    with commands.bare(made):
-        yield made
-
-
-def test_a_newcomer_meets_nothing_that_is_wrong(folder: Path) -> None:
-    parts = dict(newcomer().walk(quick=True, programs=False))
-    assert [problem for problems in parts.values() for problem in problems] == []
-    assert {name.partition(" ")[0].partition(":")[0] for name in parts} >= set(commands.commands())
+def test_a_newcomer_meets_nothing_that_is_wrong(tmp_path: Path) -> None:
+    with commands.bare(tmp_path):
+        parts = list(newcomer().walk(quick=True, programs=False))
+    assert [problem for _, problems, _ in parts for problem in problems] == []
+    walked = {name.partition(" ")[0].partition(":")[0] for name, _, _ in parts}
+    assert walked >= set(commands.commands())
 
 
 def test_what_is_wrong_is_seen() -> None:
@@ -129,11 +124,13 @@ def test_faults_of_a_help_are_seen() -> None:
 
 
 def test_a_traceback_and_a_file_that_is_not_written_are_seen(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("planted")
 
+    monkeypatch.chdir(tmp_path)
+    eg.samples.copy(tmp_path)
     command = commands.commands()["refine"]
     done = commands.in_process(*command.words())
     silent = commands.Run(done.words, 0, done.out, done.err)
