@@ -42,14 +42,14 @@ lint: $(STAMPS)/tox ## ruff: rules and format
 types: $(STAMPS)/tox ## mypy --strict
 	$(TOX) -e types
 
-sanitize: $(STAMPS)/tox ## the C library under AddressSanitizer and UBSan (takes minutes)
+sanitize: $(STAMPS)/tox ## the C library under AddressSanitizer and UBSan (about ten minutes)
 	$(TOX) -e sanitize
 
-cross: $(STAMPS)/venv ## compile the C library for other systems, by zig (takes minutes)
+cross: $(STAMPS)/venv ## compile the C library for other systems, by zig (about ten minutes)
 	$(PIP) install ziglang
 	PYTHON=$(BIN)/python tests/package/cross.sh
 
-newcomer: $(STAMPS)/venv ## walk every command, page and example in a new environment (takes minutes)
+newcomer: $(STAMPS)/venv ## walk every command, page and example in a new environment (about ten minutes)
 	$(BIN)/python tests/package/newcomer.py
 
 mutants: $(STAMPS)/dev ## plant faults one at a time, report those that no test notices (takes hours)

@@ -232,9 +232,12 @@ def _nearest(
     # Squares by a product of matrices: five times as fast as OpenCV, and exact for SIFT, whose
     # descriptors are whole numbers with squares below 2^24.
     others_squared = np.einsum("ij,ij->i", others, others)
+    # One table for all blocks: a quarter of the time would else go into pages of new memory.
+    table = np.empty((min(_BLOCK, len(queries)), len(others)), dtype=others.dtype)
     for first in range(0, len(queries), _BLOCK):
         some = queries[first : first + _BLOCK]
-        squared = others_squared - 2.0 * (some @ others.T)
+        squared = np.matmul(-2.0 * some, others.T, out=table[: len(some)])
+        squared += others_squared
         rows = np.arange(len(some))
         index = squared.argmin(axis=1)
         least = squared[rows, index]

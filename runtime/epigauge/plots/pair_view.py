@@ -48,12 +48,13 @@ def reduced(photo: Image, longest: int) -> tuple[Image, tuple[int, int]]:
     step = min(-(-max(height, width) // longest), height, width)
     bottom, right = height // step * step, width // step * step
     # Sums run along the memory: rows first, then columns of what is left.
-    rows = np.zeros((bottom // step, right, *photo.shape[2:]), dtype=np.uint32)
+    shape = (bottom // step, right, *photo.shape[2:])
+    rows = np.zeros(shape, dtype=np.min_scalar_type(255 * step))
     for k in range(step):
         rows += photo[k:bottom:step, :right]
-    total = rows[:, ::step]
+    total = rows[:, ::step].astype(np.uint32)
     for k in range(1, step):
-        total = total + rows[:, k::step]
+        total += rows[:, k::step]
     return (total // step**2).astype(np.uint8), (right, bottom)
 
 
