@@ -75,6 +75,20 @@ def test_the_index_shows_a_page_without_links_into_the_checkout() -> None:
     assert all(" ".join(words) in whole for words in commands)
 
 
+def test_versions_of_python_are_those_that_are_tested() -> None:
+    named = re.findall(r"Python :: (3\.\d+)$", "\n".join(PROJECT["classifiers"]), re.MULTILINE)
+    matrix = (CHECKOUT / ".github" / "workflows" / "tests.yml").read_text()
+    listed = re.search(r"python-version: \|\n((?: +3\.\d+\n)+)", matrix)
+    assert listed
+    assert sorted(listed[1].split()) == sorted(named)
+    for page in ("README.md", PROJECT["readme"], "docs/quickstart.md"):
+        said = re.search(
+            r"[Tt]ested on (?:Python )?(3\.\d+) to (3\.\d+)", (CHECKOUT / page).read_text()
+        )
+        assert said
+        assert said.groups() == (named[0], named[-1])
+
+
 def test_addresses_are_open_about_being_placeholders() -> None:
     """Until there are public ones: names in .example are reserved, nobody can own them."""
     for address in PROJECT["urls"].values():

@@ -196,6 +196,11 @@ def test_what_hloc_does_not_hold_is_told(hloc: tuple[Path, Path], tmp_path: Path
         eg.load_matches(matches, features=Path(__file__), pair=NAMES)
     with pytest.raises(FileFormatError, match=r"holds no keypoints of db/left\.jpg"):
         eg.load_matches(matches, features=matches, pair=NAMES)
+    # The only pair needs no name, but keypoints in folders do: db-left.jpg could be db/left.jpg.
+    with pytest.raises(FileFormatError, match=r"no keypoints of db-left\.jpg \(.*: say pair="):
+        eg.load_matches(matches, features=features)
+    with pytest.raises(FileNotFoundError):
+        eg.load_matches(matches, features=tmp_path / "missing.h5", pair=NAMES)
     (tmp_path / "empty.h5").write_bytes(b"")
     with pytest.raises(FileFormatError, match="is not a readable HDF5 file"):
         eg.load_matches(tmp_path / "empty.h5")

@@ -155,8 +155,8 @@ def read_hdf5(
             needed = "features='...h5', the file of their keypoints"
             raise ArgumentError("features", "is None, and the file holds matches alone", needed)
         with (
-            damage(features, "is not a readable HDF5 file"),
             features.open("rb") as stream,
+            damage(features, "is not a readable HDF5 file"),
             h5py.File(stream, "r") as content,
         ):
             for k, name in enumerate(names):
@@ -197,7 +197,12 @@ def _keypoints(path: Path, content: Any, name: str) -> Array:
     for known in (name, name.replace("/", "-")):
         if known in content and _is(content[known]) and "keypoints" in content[known]:
             return _read(path, content[known]["keypoints"], f"{name}/keypoints")
-    raise FileFormatError(path, f"holds no keypoints of {cut(name)}")
+    # Names of pairs have - for the / of folders, which only the names of keypoints show.
+    raise FileFormatError(
+        path,
+        f"holds no keypoints of {cut(name)} (it holds {listed(list(content))}): "
+        "say pair=(name, name) with the names of the photographs, with their folders",
+    )
 
 
 def _read(path: Path, dataset: Any, name: str) -> Array:
