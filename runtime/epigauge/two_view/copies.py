@@ -124,6 +124,9 @@ def contradicted(x1: Array, x2: Array) -> NDArray[np.bool_]:
     """
     several = np.zeros(len(x1), np.bool_)
     for x in (x1, x2):
+        across = np.sort(x[:, 0])
+        if not np.any(across[_SEVERAL:] == across[:-_SEVERAL]):
+            continue  # as for most pairs: no more points on one line, let alone in one place
         _, place, counts = np.unique(x @ [1.0, 1.0j], return_inverse=True, return_counts=True)
         several |= counts[place] > _SEVERAL
     return several
