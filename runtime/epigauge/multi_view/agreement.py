@@ -19,7 +19,7 @@ from epigauge.cameras import camera_model
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 from epigauge.scatter import spread
-from epigauge.two_view.conditioning import condition
+from epigauge.two_view.conditioning import condition_raw
 from epigauge.two_view.consensus import Consensus
 from epigauge.two_view.losses import Loss
 
@@ -65,7 +65,7 @@ def agreed_fundamental(kernels: Table, x1: Array, x2: Array) -> tuple[Array, Mas
     ArgumentError
         Where fewer than eight matches agree.
     """
-    frame = condition(x1, x2)
+    frame, is_near = condition_raw(x1, x2, 8)
     consensus = Consensus(kernels, *frame.forward(x1, x2))
     F = consensus.linear_fits(np.ones((1, consensus.products.shape[1])))[0]
     rng = np.random.default_rng(0)
@@ -74,7 +74,7 @@ def agreed_fundamental(kernels: Table, x1: Array, x2: Array) -> tuple[Array, Mas
     drawn = consensus.promising(consensus.subset_fits(everything, rng), rough)
     starts = [consensus.judge(one, sigma) for one in (F, *drawn) for sigma in _SIGMAS]
     found = consensus.search(starts, rng)
-    agrees = found.inliers(_AGREES * max(found.sigma, 1e-9))
+    agrees = found.inliers(_AGREES * max(found.sigma, 1e-9)) & is_near
     if np.count_nonzero(agrees) < 8:
         raise ArgumentError("x1, x2", "agree on no epipolar geometry", "matches that do")
     return frame.to_pixels(found.F), agrees

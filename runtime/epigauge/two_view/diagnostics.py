@@ -286,6 +286,8 @@ def plane_flags(found: Evidence, *, tested: bool = False) -> dict[str, bool]:
 def _is_affine(found: Evidence, on: NDArray[np.bool_]) -> bool:
     """Tell whether an affine F explains some matches as well, but for its fewer parameters."""
     weights = found.weights[on]
+    if not np.any(weights):
+        return False
     bound = float(weights @ found.squared[on]) + AFFINE * max(found.noise, ROUNDING) ** 2
     return affine_cost(found.q1[:, on], found.q2[:, on], weights) <= bound
 

@@ -22,7 +22,7 @@ from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
 from epigauge.two_view.chance import CEILING, SIGNIFICANT, chance_on_plane, log10_false_alarms
 from epigauge.two_view.collinear import is_plane_left_open
-from epigauge.two_view.conditioning import condition
+from epigauge.two_view.conditioning import condition_raw
 from epigauge.two_view.consensus import RANGE
 from epigauge.two_view.copies import earliest
 from epigauge.two_view.evidence import ROUNDING
@@ -180,7 +180,7 @@ def estimate_homography(
         raise ArgumentError("x1, x2", f"hold {len(rows)} different matches", "at least 4")
     copies = np.searchsorted(rows, first)
     y1, y2 = x1[rows], x2[rows]
-    frame = condition(y1, y2)
+    frame, is_near = condition_raw(y1, y2, LEAST)
     table, (q1, q2) = kernels.table(known.get("backend")), frame.forward(y1, y2)
     order = ranked(table, q1, q2)
     if promise is not None:
@@ -195,10 +195,11 @@ def estimate_homography(
         mixture = PlaneMixture.of(squared, mixture.sigma)
         limit = min(mixture.even, DEVIATIONS * mixture.sigma, CEILING * RANGE)
         limit = max(limit, ROUNDING) if threshold is None else threshold / frame.scale
-        inlier = squared <= limit**2
+        inlier = (squared <= limit**2) & is_near
         if np.count_nonzero(inlier) < LEAST:
             inlier = np.zeros(len(rows), np.bool_)
-            inlier[np.argsort(squared, kind="stable")[:LEAST]] = True
+            away = np.where(is_near, squared, np.inf)
+            inlier[np.argsort(away, kind="stable")[:LEAST]] = True
         if is_open or inlier.tobytes() in tried:
             break
         tried.add(inlier.tobytes())
@@ -213,7 +214,7 @@ def estimate_homography(
                 if is_open or error.argument not in ("x1", "x2", "H0"):
                     raise
             # All that agree are in one place or on one line, and leave H open: fitted to all
-            used, H0, is_open = np.ones(len(rows), np.bool_), None, True
+            used, H0, is_open = is_near, None, True
         H = frame.homography_from_pixels(result.H)
     assert result is not None
     bound = min(limit, CEILING * RANGE)  # within more, wrong matches agree, too

@@ -22,11 +22,12 @@ from epigauge._options import Backend
 from epigauge._results import Result
 from epigauge.errors import ArgumentError
 from epigauge.two_view.chance import SIGNIFICANT
-from epigauge.two_view.conditioning import condition
+from epigauge.two_view.conditioning import condition_raw
 from epigauge.two_view.consensus import RANGE, Consensus
 from epigauge.two_view.copies import earliest
 from epigauge.two_view.essential import rotation_between
 from epigauge.two_view.homography import plane_squares
+from epigauge.two_view.homography_refine import LEAST
 from epigauge.two_view.homography_result import HomographyResult
 from epigauge.two_view.homography_search import PlaneMixture, estimate_homography
 from epigauge.two_view.refine import calibrations
@@ -294,7 +295,7 @@ def _may_have_relief(plane: HomographyResult | None, x1: Array, x2: Array) -> bo
     """
     if plane is None:
         return False
-    agreed, extent = len(plane.used), RANGE * condition(x1, x2).scale
+    agreed, extent = len(plane.used), RANGE * condition_raw(x1, x2, LEAST)[0].scale
     near = min(2.0 * plane.threshold_px / (_RELIEF * extent), 1.0)
     expected = math.log10(math.comb(agreed, 4)) + (agreed - 4) * math.log10(max(near, 1e-300))
     return expected > SIGNIFICANT
@@ -312,7 +313,7 @@ def _evidence(
     """Return the likelihoods of all models, the rotation, and whether F explains no more than H."""
     rows = np.flatnonzero(earliest(x1, x2) == np.arange(len(x1)))
     y1, y2 = x1[rows], x2[rows]
-    frame = condition(y1, y2)
+    frame, _ = condition_raw(y1, y2, LEAST)
     table, (q1, q2) = kernels.table(backend), frame.forward(y1, y2)
     m = len(rows)
     wrong = -2.0 * m * math.log(RANGE)

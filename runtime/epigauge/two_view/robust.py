@@ -19,7 +19,7 @@ from epigauge._options import FrontEnd, RefineOptions, known_options
 from epigauge.errors import ArgumentError
 from epigauge.two_view import quick
 from epigauge.two_view.chance import chance_agreement
-from epigauge.two_view.conditioning import Conditioning, condition
+from epigauge.two_view.conditioning import Conditioning, condition_raw
 from epigauge.two_view.confidence import Confidence, Signs, probability_below
 from epigauge.two_view.consensus import RANGE, WIDEST, Agreement, Consensus
 from epigauge.two_view.copies import contradicted, earliest
@@ -309,6 +309,8 @@ class _Raw:
         Backend.
     frame : Conditioning
         Conditioned coordinates.
+    is_near : ndarray of bool, shape (m,)
+        Whether a match is not absurdly far from the others, where none agrees but by accident.
     q : tuple of ndarray
         The matches there.
     consensus : Consensus
@@ -324,6 +326,7 @@ class _Raw:
     x2: Array
     table: kernels.Table
     frame: Conditioning
+    is_near: Mask
     q: tuple[Array, Array]
     consensus: Consensus
     least: int
@@ -339,10 +342,13 @@ class _Raw:
             )
         copies, m = np.searchsorted(rows, first), len(x1)
         x1, x2 = x1[rows], x2[rows]
-        frame, table = condition(x1, x2), kernels.table(options.get("backend"))
+        (frame, is_near), table = (
+            condition_raw(x1, x2, least),
+            kernels.table(options.get("backend")),
+        )
         q = frame.forward(x1, x2)
         consensus = Consensus(table, *q)
-        return _Raw(m, rows, copies, x1, x2, table, frame, q, consensus, least)
+        return _Raw(m, rows, copies, x1, x2, table, frame, is_near, q, consensus, least)
 
     def agreeing(self) -> _Raw:
         """Return the matches that do not contradict each other, if they are enough to search."""
@@ -355,9 +361,19 @@ class _Raw:
             rows=self.rows[kept],
             x1=self.x1[kept],
             x2=self.x2[kept],
+            is_near=self.is_near[kept],
             q=(q1, q2),
             consensus=Consensus(self.table, q1, q2),
         )
+
+    def inliers(self, agreement: Agreement, limit: float) -> Mask:
+        """Return the inliers, or the least number of nearest, of which the result means nothing."""
+        inlier = agreement.inliers(limit) & self.is_near
+        if np.count_nonzero(inlier) < self.least:
+            away = np.where(self.is_near, np.abs(agreement.signed), np.inf)
+            inlier = np.zeros(len(inlier), np.bool_)
+            inlier[np.argsort(away)[: self.least]] = True
+        return inlier
 
 
 class _Fit(NamedTuple):
@@ -377,7 +393,7 @@ def _fitted(raw: _Raw, agreement: Agreement, given: float | None, options: dict[
     """Refine F by its inliers until they stand still, within a distance that may be given."""
     scale = raw.frame.scale
     limit = _at_most(agreement.mixture.even) if given is None else given
-    inlier = _at_least(raw.least, agreement, limit)
+    inlier = raw.inliers(agreement, limit)
     fitted: set[bytes] = set()
     is_open = False
     while not is_open and inlier.tobytes() not in fitted and len(fitted) < _ROUNDS:
@@ -393,14 +409,14 @@ def _fitted(raw: _Raw, agreement: Agreement, given: float | None, options: dict[
                 if is_open or error.argument not in ("x1", "x2", "F0"):
                     raise
             # All that agree are in one place or on one line, and leave F open: fitted to all
-            used, F0, is_open = np.ones(len(raw.rows), np.bool_), None, True
+            used, F0, is_open = raw.is_near, None, True
         F = raw.frame.from_pixels(refined.F)
         signed, oriented = raw.consensus.measured(F)
         agreement = replace(agreement, F=F, signed=signed, oriented=oriented)
         if given is None:
             sigma = robust_scale(agreement.signed[used])
             limit = min(limit, max(_DEVIATIONS * sigma, 1e-9))
-        inlier = _at_least(raw.least, agreement, limit)
+        inlier = raw.inliers(agreement, limit)
     return _Fit(refined, agreement, used, inlier, limit, limit_px, len(fitted), is_open)
 
 
@@ -431,7 +447,8 @@ class _Asked:
         if not self.is_limited:  # real noise has heavier tails than three deviations of its core
             agreed = self.raw.consensus.judge(agreed.F, agreed.sigma, agreed.share)
             bound = max(bound, _at_most(agreed.mixture.even))
-        return agreed, bound, agreed.inliers(bound)  # where fewer than 8, "no common geometry"
+        near = agreed.inliers(bound) & self.raw.is_near
+        return agreed, bound, near  # where fewer than 8, "no common geometry"
 
     @cached_property
     def among_all(self) -> Evidence:
@@ -499,15 +516,6 @@ def _rest(refined: FundamentalResult, limit_px: float | None) -> SimpleNamespace
         known |= {"noise_px": noise_px, "_uncertainty": spread}
         known["covariance"] = spread.of_fundamental()
     return SimpleNamespace(**known)
-
-
-def _at_least(count: int, agreement: Agreement, limit: float) -> Mask:
-    """Return the inliers, or so many nearest matches for a result that says it means nothing."""
-    inlier = agreement.inliers(limit)
-    if np.count_nonzero(inlier) < count:
-        inlier = np.zeros(len(inlier), np.bool_)
-        inlier[np.argsort(np.abs(agreement.signed))[:count]] = True
-    return inlier
 
 
 def _at_most(limit: float) -> float:
