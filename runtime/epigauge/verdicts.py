@@ -194,9 +194,10 @@ FLAGS = {
         ("views",),
     ),
     "strayed views": Flag(
-        "most observations of a view were set aside as gross errors: its camera is wrong, or its "
-        "matches are",
-        "leave the views out that the message names, match them anew, or begin elsewhere",
+        "most observations of a view are gross errors, set aside or given up by a robust loss: its "
+        "camera is wrong, or its matches are",
+        "find such cameras anew with robust=True (`epigauge bundle --robust`); views that its "
+        "message names still leave out, match anew, or begin elsewhere",
         ("views",),
     ),
     "outliers": Flag(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import epigauge as eg
 import many_views
@@ -151,3 +153,45 @@ def test_views_stray_where_most_of_what_counts_is_set_aside() -> None:
     assert strayed(tracks, rejected).tolist() == [2]
     off = tracks.weighted(np.where(np.isin(np.arange(len(tracks)), own[:2]), 0.0, 1.0))
     assert not len(strayed(off, np.isin(np.arange(len(tracks)), own[:20])))  # 18 of 38
+
+
+def with_one_mixed(tracks: eg.Tracks, view: int, share: float = 1.0) -> eg.Tracks:
+    """Return the tracks with a share of one view's observations given to one another's points."""
+    xy, rng = tracks.xy.copy(), np.random.default_rng(5)
+    own = np.flatnonzero(tracks.view == view)
+    own = own[rng.random(len(own)) < share]
+    xy[own] = xy[rng.permutation(own)]
+    return eg.Tracks(tracks.view, tracks.point, xy)
+
+
+@pytest.mark.parametrize("kind", ["metric", "projective", "lines", "parts"])
+@pytest.mark.parametrize("loss", ["cauchy", "huber"])
+def test_a_robust_loss_that_gives_a_view_up_says_so(
+    kind: str, loss: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """In every entry: the view has no part in what is called a minimum of all."""
+    made = eg.line_scene(seed=3)
+    for is_wrong in (False, True):
+        tracks = with_one_mixed(made.tracks, 5) if is_wrong else made.tracks
+        found: Any
+        if kind == "parts":
+            client = request.getfixturevalue("client")
+            start = replace(made.true, lines=None)
+            folder = eg.distributed.write_parts(tracks, tmp_path / str(is_wrong), start)
+            found = eg.distributed.bundle_adjust(folder, client, refine="pose", loss=loss)
+        elif kind == "projective":
+            found = eg.bundle_adjust(tracks, made.true.to_projective(), loss=loss)
+        else:
+            lines = {"lines": made.line_tracks} if kind == "lines" else {}
+            found = eg.bundle_adjust(tracks, made.true, refine="pose", loss=loss, **lines)
+        assert ("strayed views" in found.flags) == is_wrong
+        assert found.success != is_wrong
+
+
+def test_an_upgrade_tells_of_a_view_of_wrong_matches() -> None:
+    scene = eg.multi_view_scene(n_views=8, noise_px=0.3, focal=900.0, seed=3)
+    tracks = scene.tracks
+    found = eg.metric_upgrade(with_one_mixed(tracks, 4, 0.7), image_size=(800, 600))
+    assert not found.success
+    assert "strayed views" in found.flags
+    assert eg.metric_upgrade(tracks, image_size=(800, 600)).success

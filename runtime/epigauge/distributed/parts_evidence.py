@@ -70,6 +70,10 @@ class PartsTail:
         """Return how many are above a limit."""
         return int(sum(self._asked("above", self._weighted, limit)))
 
+    def far_of_views(self, n: int, limit: float) -> Indices:
+        """Return how many of each of n views are above a limit, (n,)."""
+        return np.asarray(sum(self._asked("far_of_views", self._weighted, n, limit)), np.intp)
+
     def ranked(self, axis: int, ranks: Sequence[int]) -> Array:
         """Return measured coordinates of rising rank, from 0, in one direction of the image."""
         return self.selected((X_AXIS, Y_AXIS)[axis], ranks)
@@ -148,6 +152,10 @@ class PartsEvidence:
         """Return the number of observations of each view, (n,)."""
         n = self._found.n_views
         return np.asarray(sum(self._ask("views", n)), np.intp)
+
+    def far_of_views(self, limit: float) -> Indices:
+        """Return how many of the weighted lengths of each view are above a limit, (n,)."""
+        return self.tail.far_of_views(self._found.n_views, limit)
 
     def open(self) -> tuple[str, ...]:
         """Return what the network lacks: names of flags."""

@@ -57,6 +57,15 @@ def above(own: Evaluation, cameras: Array, points: Array, weighted: bool, limit:
     return int(np.count_nonzero(_distances(own, residuals, weighted) > limit))
 
 
+def far_of_views(
+    own: Evaluation, cameras: Array, points: Array, weighted: bool, n: int, limit: float
+) -> Indices:
+    """Return how many lengths of each view are above a limit, (n,)."""
+    residuals, _ = _residuals(own, cameras, points)
+    far = _distances(own, residuals, weighted) > limit
+    return np.bincount(_views(own)[far], minlength=n)
+
+
 def histogram(
     own: Evaluation, cameras: Array, points: Array, weighted: bool, what: str
 ) -> tuple[Keys, Indices]:
@@ -129,5 +138,5 @@ def _views(own: Evaluation) -> Indices:
 
 
 #: By the names that they are asked by.
-OF_FIT: dict[str, Any] = {f.__name__: f for f in (facts, above, histogram, within)}
+OF_FIT: dict[str, Any] = {f.__name__: f for f in (facts, above, far_of_views, histogram, within)}
 NETWORK: dict[str, Any] = {f.__name__: f for f in (views, ties, around, moved)}

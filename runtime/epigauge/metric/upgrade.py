@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,9 +22,8 @@ from epigauge.metric.search import MODELS, Search, metric_of
 from epigauge.metric.verdict import judged, noise_px
 from epigauge.multi_view.adjust import BundleResult, bundle_adjust
 from epigauge.multi_view.reconstruction import Reconstruction
-from epigauge.multi_view.rejection import GrossErrors
+from epigauge.multi_view.rejection import GrossErrors, with_set_aside
 from epigauge.multi_view.tracks import Tracks
-from epigauge.verdicts import ordered
 
 __all__ = ["metric_upgrade"]
 
@@ -145,7 +143,11 @@ def _adjusted(
     """
     search = GrossErrors(tracks, kernels.table(backend))
     given = np.asarray(tracks.weights)
-    found = bundle_adjust(tracks, start, loss="cauchy", ftol=_EARLY, **options)
+
+    def robust(start: MetricReconstruction) -> BundleResult:
+        return bundle_adjust(tracks, start, loss="cauchy", ftol=_EARLY, **options)
+
+    found = search.settled(robust, start, np.zeros(0, np.intp))
     aside = _aside(search, found)
     if options["priors"]:  # they count beside the noise
         options = options | {"noise_px": noise_px(found, tracks, aside | (given == 0.0))}
@@ -158,9 +160,7 @@ def _adjusted(
     flags = set(found.flags)
     if (metric_of(found).depths(tracks) > 0.0)[~before & (given > 0.0)].all():
         flags.discard("behind the cameras")
-    count = f"{np.count_nonzero(before)} of {len(tracks)}"
-    message = f"{found.message}; {count} observations set aside as gross errors"
-    return replace(found, rejected=before, flags=ordered(flags), message=message)
+    return with_set_aside(found, tracks, before, flags)
 
 
 def _aside(search: GrossErrors, bundle: BundleResult) -> NDArray[np.bool_]:

@@ -22,7 +22,7 @@ from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.tracks import Tracks
 from epigauge.multi_view.verdicts.counting import missing_beside
 from epigauge.multi_view.verdicts.front import BEHIND
-from epigauge.multi_view.verdicts.gross import TailOfArrays, gross_flags
+from epigauge.multi_view.verdicts.gross import TailOfArrays, gross_flags, strayed_flags
 from epigauge.multi_view.verdicts.projective import judged
 from epigauge.multi_view.verdicts.verdict import Verdict
 from epigauge.two_view.losses import Loss, median
@@ -121,11 +121,23 @@ def judged_lines(parts: LinesFound, table: Table, loss: Loss, finite: bool) -> V
         raised.update(gross_flags(TailOfArrays(sizes, measured[counts]), noise))
         if (of_lines > _WRONG * max(noise, _EXACT)).any():
             raised.add("wrong segments")
+    elif parts.depths is not None:  # of projective cameras the points have told it
+        raised.update(_strayed(tracks, np.sqrt(tracks.weights) * of_points, noise, job.scale_px))
     if diagnosis.missing:
         raised.add("undetermined")
     if (noise / job.scale_px * spreads(system.normal.others[0].V) > OPEN).any():
         raised.add("open lines")
     return Verdict(ordered(raised), diagnosis.rank, n_behind, diagnosis.condition)
+
+
+def _strayed(tracks: Tracks, sizes: Array, noise: float, scale: float) -> tuple[str, ...]:
+    """Return the flag of views most of whose points, of weighted distances (N,), are far off."""
+    every, n = tracks.view[tracks.weights > 0.0], tracks.n_views
+
+    def far_of_views(limit: float) -> Indices:
+        return np.bincount(tracks.view[sizes > limit], minlength=n)
+
+    return strayed_flags(far_of_views, np.bincount(every, minlength=n), noise, scale)
 
 
 def _diagnosis(parts: LinesFound, system: BundleSystem, table: Table) -> Diagnosis:

@@ -8,6 +8,7 @@ a camera that strayed: it is found anew from the points that the others hold, or
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -23,6 +24,7 @@ from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.result import told
 from epigauge.multi_view.strayed import found_anew, strayed
 from epigauge.multi_view.tracks import MIN_VIEWS, Tracks
+from epigauge.multi_view.verdicts.gross import GROSS
 from epigauge.multi_view.verdicts.verdict import Verdict
 from epigauge.two_view.losses import EFFICIENT, median
 from epigauge.verdicts import ordered
@@ -30,7 +32,7 @@ from epigauge.verdicts import ordered
 if TYPE_CHECKING:
     from epigauge.multi_view.adjust import BundleResult
 
-__all__ = ["Adjust", "GrossErrors", "without_gross_errors"]
+__all__ = ["Adjust", "GrossErrors", "with_set_aside", "without_gross_errors"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -38,10 +40,6 @@ Indices = NDArray[np.intp]
 
 #: Median distance of two normal coordinates of standard deviation one.
 _MEDIAN = 1.1774
-
-#: An observation is a gross error beyond this many standard deviations: none in ten million of
-#: normal ones, but measured ones have heavier tails.
-_GROSS = 6.0
 
 #: Robust adjustments at most, the decrease of the median distance that asks for another, and
 #: rounds of setting aside.
@@ -99,14 +97,9 @@ def without_gross_errors(
         The last adjustment, with what was set aside in `rejected`.
     """
     search = GrossErrors(tracks, kernels)
-    found = _agreed(adjust, search, start)
-    for _ in range(_ANEW):
-        if found.status == -2:
-            return found
-        begun = search.found_anew(found.reconstruction, fixed_views)
-        if begun is None:
-            break
-        found = _agreed(adjust, search, begun)
+    found = search.settled(lambda start: _agreed(adjust, search, start), start, fixed_views)
+    if found.status == -2:
+        return found
     start, rejected = found.reconstruction, search.gross(found.reconstruction)
     for _ in range(_ROUNDS):
         kept = search.without(rejected)
@@ -119,13 +112,32 @@ def without_gross_errors(
     moved = start is not found.reconstruction
     fun = tracks.xy - start.project(tracks) if moved else found.fun
     # The last one alone: a copy is judged, which those before need not be.
-    left = strayed(tracks, aside)
-    if len(left):
-        flags = ordered((*found.flags, "strayed views"))
-        verdict = Verdict(flags, found.rank, found.n_behind, found.condition, found.weakest)
-        found = replace(found, **told(verdict, found.status))
-    message = _told(found.message, aside, left)
-    return replace(found, reconstruction=start, fun=fun, rejected=aside, message=message)
+    found = replace(found, reconstruction=start, fun=fun)
+    return with_set_aside(found, tracks, aside, found.flags)
+
+
+def with_set_aside(
+    found: BundleResult, tracks: Tracks, rejected: Mask, flags: Iterable[str]
+) -> BundleResult:
+    """Return a result that tells what was set aside, and whether that is most of a view.
+
+    Parameters
+    ----------
+    found : BundleResult
+        The last adjustment.
+    tracks : Tracks
+        All observations.
+    rejected : ndarray of bool, shape (N,)
+        What was set aside of them.
+    flags : iterable of str
+        What can be said against the rest.
+    """
+    left = strayed(tracks, rejected)
+    flags = ordered((*flags, *["strayed views"][: len(left)]))
+    verdict = Verdict(flags, found.rank, found.n_behind, found.condition, found.weakest)
+    fields = told(verdict, found.status)
+    fields["message"] = _told(fields["message"], rejected, left)
+    return replace(found, rejected=rejected, **fields)
 
 
 def _agreed(adjust: Adjust, search: GrossErrors, start: Any) -> BundleResult:
@@ -215,7 +227,20 @@ class GrossErrors:
     def _limit(self, distances: Array) -> float:
         """Return the distance beyond which an observation is a gross error."""
         noise = median(distances[self.counts]) / _MEDIAN
-        return _GROSS * max(noise, 1e-12 * self.frame.scale)
+        return GROSS * max(noise, 1e-12 * self.frame.scale)
+
+    def settled(
+        self, adjusted: Callable[[Any], BundleResult], start: Any, fixed_views: Indices
+    ) -> BundleResult:
+        """Adjust robustly, and again where doubtful cameras are found anew."""
+        found = adjusted(start)
+        for _ in range(_ANEW):
+            stopped = found.status == -2
+            begun = None if stopped else self.found_anew(found.reconstruction, fixed_views)
+            if begun is None:
+                break
+            found = adjusted(begun)
+        return found
 
     def found_anew(self, found: Any, fixed_views: Indices) -> Any | None:
         """Return the reconstruction with doubtful cameras where the points of others want them.

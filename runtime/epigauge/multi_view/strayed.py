@@ -21,6 +21,7 @@ from epigauge.multi_view.reconstruction import Reconstruction
 from epigauge.multi_view.resection import resect
 from epigauge.multi_view.three_points import agreed_pose
 from epigauge.multi_view.tracks import MIN_POINTS, MIN_VIEWS, Tracks
+from epigauge.multi_view.verdicts.gross import STRAYED
 
 __all__ = ["found_anew", "strayed"]
 
@@ -28,15 +29,15 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-#: A view has strayed where more than this share of its observations is set aside; where more than
-#: the second is, its camera is looked for elsewhere, and taken where so many times as many agree.
-_MOST, _MANY, _MORE = 0.5, 0.2, 1.1
+#: Where more than this share of a view's observations is set aside, its camera is looked for
+#: elsewhere, and taken where so many times as many agree.
+_MANY, _MORE = 0.2, 1.1
 
 #: Half a turn about the x axis: cameras that look along -z as if they did along z.
 _HALF_TURN = np.diag([1.0, -1.0, -1.0])
 
 
-def strayed(tracks: Tracks, rejected: Mask, share: float = _MOST) -> Indices:
+def strayed(tracks: Tracks, rejected: Mask, share: float = STRAYED) -> Indices:
     """Return the views of whose observations more than a share, most, are set aside.
 
     Parameters

@@ -44,6 +44,9 @@ class Evidence(Protocol):
     def of_views(self) -> Indices:
         """Return the number of observations of each view that count, (n,)."""
 
+    def far_of_views(self, limit: float) -> Indices:
+        """Return how many of the weighted lengths of each view are above a limit, (n,)."""
+
     @property
     def rms(self) -> float:
         """Return the RMS of the coordinates of the residuals as they are, in pixels."""
@@ -112,6 +115,11 @@ class EvidenceOfTracks:
         """Return the number of observations of each view that count, (n,)."""
         tracks = self.tracks
         return np.bincount(tracks.view[tracks.weights > 0.0], minlength=tracks.n_views)
+
+    def far_of_views(self, limit: float) -> Indices:
+        """Return how many of the weighted lengths of each view are above a limit, (n,)."""
+        own = self.tracks.view[self.tracks.weights > 0.0]
+        return np.bincount(own[self.tail.distances > limit], minlength=self.tracks.n_views)
 
     def misses(self, limit: float) -> bool:
         """Tell whether half of the observations that count are farther from their images."""

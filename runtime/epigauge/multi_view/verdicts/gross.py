@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -12,9 +12,15 @@ from numpy.typing import NDArray
 
 from epigauge.two_view.losses import median
 
-__all__ = ["Tail", "TailOfArrays", "gross_flags"]
+__all__ = ["GROSS", "STRAYED", "Tail", "TailOfArrays", "gross_flags", "strayed_flags"]
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: An observation is a gross error beyond this many standard deviations: none in ten million of
+#: normal ones, but measured ones have heavier tails. A view has strayed where more than such a
+#: share of its observations is one.
+GROSS, STRAYED = 6.0, 0.5
 
 #: Root mean square over the noise that the median tells, above which few observations carry the
 #: cost: up to five in raw tracks that still lead to their optimum.
@@ -122,6 +128,26 @@ def gross_flags(tail: Tail, noise_px: float) -> tuple[str, ...]:
     apart = far >= max(_FEW, _FEW_SHARE * N) and near <= _APART * far
     left = apart or near > _MANY_NEAR * N or far > _MANY_FAR * N
     return ("outliers",) if left else ()
+
+
+def strayed_flags(
+    far_of_views: Callable[[float], Indices], every: Indices, noise_px: float, scale: float
+) -> tuple[str, ...]:
+    """Return "strayed views" where a robust loss has given up most of what a view observes.
+
+    Parameters
+    ----------
+    far_of_views : callable
+        Returns how many residuals of each view are longer than a limit, (n,).
+    every : ndarray of int, shape (n,)
+        Observations of each view that count.
+    noise_px : float
+        Standard deviation of a coordinate, as the median of the residuals tells it.
+    scale : float
+        RMS of the image coordinates about the centroids of the views, in pixels.
+    """
+    far = far_of_views(GROSS * max(noise_px, _EXACT * scale))
+    return ("strayed views",) if (far > STRAYED * every).any() else ()
 
 
 def _spoiled(tail: Tail, noise_px: float, extent: float) -> bool:

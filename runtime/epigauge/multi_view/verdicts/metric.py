@@ -14,7 +14,7 @@ from epigauge.kernels import Table
 from epigauge.multi_view.verdicts.distant import distance_flags, relative_depths
 from epigauge.multi_view.verdicts.evidence import Evidence
 from epigauge.multi_view.verdicts.front import BEHIND
-from epigauge.multi_view.verdicts.gross import gross_flags
+from epigauge.multi_view.verdicts.gross import gross_flags, strayed_flags
 from epigauge.multi_view.verdicts.perspective import affine_views
 from epigauge.multi_view.verdicts.relief import flatness
 from epigauge.multi_view.verdicts.shape import flat_scene, one_line
@@ -90,6 +90,9 @@ def judged_metric(
         usual = tail.median / 1.1774 / float(np.sqrt(share_free))
         if bends:
             raised.update(gross_flags(tail, usual))
+        else:
+            every = evidence.of_views
+            raised.update(strayed_flags(evidence.far_of_views, every, usual, scale))
         noise_px = float(np.sqrt(tail.sum_of_squares / share_free / max(2 * tail.count, 1)))
         # Affine cameras are computed with in other units of the image.
         noise = noise_px if metric else noise_px / scale

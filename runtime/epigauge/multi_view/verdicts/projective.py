@@ -20,7 +20,7 @@ from epigauge.multi_view.verdicts.counting import (
     missing_by_count,
 )
 from epigauge.multi_view.verdicts.front import BEHIND, behind
-from epigauge.multi_view.verdicts.gross import TailOfArrays, gross_flags
+from epigauge.multi_view.verdicts.gross import TailOfArrays, gross_flags, strayed_flags
 from epigauge.multi_view.verdicts.network import why_open
 from epigauge.multi_view.verdicts.perspective import affine_pairs
 from epigauge.multi_view.verdicts.rank import open_directions, suits
@@ -119,6 +119,13 @@ def judged(
         raised.add("near-affine")
     if bends:
         raised.update(gross_flags(TailOfArrays(distances, seen.xy), noise_px))
+    else:
+        every = np.bincount(seen.view, minlength=seen.n)
+
+        def far_of_views(limit: float) -> Indices:
+            return np.bincount(seen.view[distances > limit], minlength=seen.n)
+
+        raised.update(strayed_flags(far_of_views, every, noise_px, frame.scale))
     if of_cameras or of_points > _OPEN * seen.m:
         raised.update(("undetermined", *why_open(tracks, rejected)))
     elif of_points or deviation > _WEAK:
