@@ -15,6 +15,7 @@ import epigauge as eg
 import many_views
 import numpy as np
 import pytest
+from epigauge import lm
 from epigauge.multi_view import result as results
 from epigauge.multi_view.parallax import fit_homographies
 from epigauge.multi_view.seen import Seen
@@ -249,6 +250,16 @@ def test_words_of_the_message_come_from_the_vocabulary() -> None:
     for name in spoiling:
         assert name in found.message
     assert "lambda" not in found.message
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_an_end_by_the_number_of_steps_says_what_is_determined_least(steps: int) -> None:
+    scene = eg.multi_view_scene(n_points=30, seed=2)
+    found = eg.bundle_adjust(scene.tracks, eg.initialize(scene.tracks), max_iter=steps, ftol=0.0)
+    assert found.status == 0
+    assert not found.success
+    assert found.weakest
+    assert found.message.startswith(f"{lm.STATUS[0]} (weakest: {found.weakest})")
 
 
 class TestVerdictWhenAsked:

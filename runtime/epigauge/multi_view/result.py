@@ -232,13 +232,16 @@ def told(verdict: Verdict, status: int) -> dict[str, Any]:
         "n_behind": verdict.n_behind,
         "condition": verdict.condition,
         "weakest": verdict.weakest,
-        "message": _message(status, verdict.flags),
+        "message": _message(status, verdict),
         "success": status > 0 and usable(verdict.flags, "views"),
     }
 
 
-def _message(status: int, flags: tuple[str, ...]) -> str:
+def _message(status: int, verdict: Verdict) -> str:
     """Return why the adjustment stopped and, where its result must not be used, why not."""
-    spoiling = [name for name in flags if not usable([name], "views")]
+    stopped = lm.STATUS[status]
+    if status == 0 and verdict.weakest:  # what a valley with many steps is along, most often
+        stopped += f" (weakest: {verdict.weakest})"
+    spoiling = [name for name in verdict.flags if not usable([name], "views")]
     reasons = [f"{name}: {FLAGS[name].sentence}" for name in spoiling]
-    return "; but ".join([lm.STATUS[status], *reasons])
+    return "; but ".join([stopped, *reasons])
