@@ -39,6 +39,18 @@ def test_two_views_give_the_focal_length() -> None:
     assert _focal_error(found) < 1e-4
 
 
+def test_a_principal_point_that_is_held_counts_in_the_standard_deviation() -> None:
+    sigmas = []
+    for seed in (3, 4, 5, 6, 8, 9):
+        tracks, _ = tracks_of("general", 400 + seed, n_views=2, noise_px=0.3, n_points=80)
+        off = np.random.default_rng(seed).normal(0.0, 0.012 * sum(SIZE), 2)
+        moved = eg.Tracks(tracks.view, tracks.point, tracks.xy + off)
+        found = eg.metric_upgrade(moved, image_size=SIZE)
+        assert found.refined == ("f",)
+        sigmas.append((found.focal_px - 900.0) / found.focal_std_px)
+    assert np.abs(sigmas).max() < 2.0  # 3.6 of those of noise alone
+
+
 def test_the_standard_deviation_is_that_of_the_errors() -> None:
     errors = []
     for seed in range(12):

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from epigauge.bundle.prior_kinds import IntrinsicPrior
 from epigauge.cameras import Cameras, MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.multi_view.adjust import bundle_adjust
@@ -15,7 +16,14 @@ from epigauge.multi_view.uncertainty import covariance
 from epigauge.uncertainty.covariance import MetricCovariance
 from epigauge.uncertainty.scatter import scatter_of
 
-__all__ = ["beside_the_bend", "beside_the_model", "focal_lengths_of", "known_to", "turn_std"]
+__all__ = [
+    "beside_the_bend",
+    "beside_the_held",
+    "beside_the_model",
+    "focal_lengths_of",
+    "known_to",
+    "turn_std",
+]
 
 Array = NDArray[np.float64]
 
@@ -35,6 +43,10 @@ _SHIFTED = 1e-4
 
 #: Views of a camera that determine the richer model, at least.
 _VIEWS = 4
+
+#: Intrinsics are refined if their standard deviations are below this share of width plus height
+#: (principal points), and this number (coefficients of distortion); others are known to as much.
+CENTRE_KNOWN, BEND_KNOWN = 0.02, 0.1
 
 #: Noise below this share of width plus height is rounding, which hangs together as it likes.
 _EXACT = 1e-6
@@ -166,6 +178,43 @@ def beside_the_bend(tracks: Tracks, known: MetricCovariance, backend: str | None
     shift = focal_lengths_of(plain) - focal_lengths_of(bent)
     by_noise = np.maximum(_focal(known)[1], _focal(sure)[1])
     return np.asarray(np.sqrt(np.maximum(shift**2 - by_noise, 0.0)))
+
+
+def beside_the_held(tracks: Tracks, known: MetricCovariance, unit: float, options: Any) -> Array:
+    """Return what each focal length is uncertain by as intrinsics were held that are not known.
+
+    A principal point is left at the centre where the motion does not determine it. It is somewhere
+    near, though, and where it is moves the focal length, by more than noise does in just these
+    motions. So with the distortion. They are unknowns here, known as of usual cameras.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        What was adjusted, with its weights.
+    known : MetricCovariance
+        Of the adjustment.
+    unit : float
+        Width plus height of the images, in pixels.
+    options : dict
+        Of `covariance`, as of the adjustment: what was refined (not all), the back end, priors.
+
+    Returns
+    -------
+    ndarray, shape (c,)
+        In pixels.
+    """
+    found = known.reconstruction
+    model = camera_model(found.cameras.model)
+    held = [name for name in model.adjusted if name not in options["refine"]]
+    usual = tuple(
+        IntrinsicPrior(c, name, row[model.params.index(name)], sigma)
+        for c, row in enumerate(found.cameras.params)
+        for name in held
+        for sigma in [CENTRE_KNOWN * unit if name in ("cx", "cy") else BEND_KNOWN]
+    )
+    freed = {"refine": model.adjusted, "priors": (*options.get("priors", ()), *usual)}
+    every = covariance(tracks, found, **options | freed | {"noise_px": known.noise_px})
+    return np.asarray(np.sqrt(np.maximum(_focal(every)[1] - _focal(known)[1], 0.0)))
 
 
 def _richer(found: MetricReconstruction) -> MetricReconstruction:

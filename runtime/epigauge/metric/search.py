@@ -13,6 +13,7 @@ from epigauge._options import UpgradeModel
 from epigauge.bundle.prior_kinds import IntrinsicPrior
 from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
+from epigauge.metric.deviation import BEND_KNOWN, CENTRE_KNOWN
 from epigauge.metric.growth import grown
 from epigauge.metric.quadric import Basis, Views, metric_bases
 from epigauge.metric.samples import Sample
@@ -34,10 +35,6 @@ MODELS = get_args(UpgradeModel)
 
 #: Metric bases that are adjusted at most.
 _CANDIDATES = 3
-
-#: Intrinsics are refined if their standard deviations are below this share of width plus height
-#: (principal points), and this number (coefficients of distortion).
-_CENTRE_KNOWN, _BEND_KNOWN = 0.02, 0.1
 
 #: Metric cameras whose median distance is so many times that of projective ones do not fit.
 _MISFIT = 2.0
@@ -334,7 +331,7 @@ class Search:
         unit = float(np.median(self.images.unit))
         for name, deviation in zip(camera_model(self.camera).adjusted, std, strict=True):
             centre, focal = name in ("cx", "cy"), name in self._first()
-            if not focal and deviation > (_CENTRE_KNOWN * unit if centre else _BEND_KNOWN):
+            if not focal and deviation > (CENTRE_KNOWN * unit if centre else BEND_KNOWN):
                 return False
         return True
 

@@ -12,6 +12,7 @@ from epigauge.errors import ArgumentError
 from epigauge.metric.checks import outside
 from epigauge.metric.deviation import (
     beside_the_bend,
+    beside_the_held,
     beside_the_model,
     focal_lengths_of,
     known_to,
@@ -62,7 +63,9 @@ def judged(
             options |= {"priors": priors, "noise_px": noise_px(bundle, tracks, weights == 0.0)}
         known = covariance(kept, found, **options)
         std, factor, erroneous = known_to(known, float(np.median(images.unit)))
-        if fit.refined == model.adjusted and not search.priors:
+        if fit.refined != model.adjusted:
+            beside = beside_the_held(kept, known, float(np.median(images.unit)), options)
+        elif not search.priors:
             beside = beside_the_model(kept, known, backend, search.options["workers"])
         if erroneous:
             flags.add("model error")
