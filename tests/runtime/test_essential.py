@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from epigauge import kernels
 from epigauge.errors import ArgumentError
+from epigauge.kernels import available
 from epigauge.two_view.essential import Calibrated, in_front
 from epigauge.two_view.essential_consensus import EssentialConsensus
 from epigauge.two_view.five_point import essential_5point
@@ -340,3 +341,31 @@ def test_distances_to_infinity_are_those_to_the_homography_of_the_rotation() -> 
     found = Calibrated(q1, q2, A1, A2).from_infinity(R)
     expected = plane_squares(table, A2 @ R @ np.linalg.inv(A1), q1, q2)
     np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def beside(folder: Path, i: int, j: int, wrong: float = 0.6) -> tuple[Array, Array, Array, Array]:
+    """Return 400 matches of views of a facade, most moved along its rows, K and the rotation."""
+    with np.load(folder / "tracks.npz") as z:
+        view, point, xy, calibration = z["view"], z["point"], z["xy"].astype(float), z["K"]
+    with np.load(folder / "reference.npz") as z:
+        turn = z["R"][j] @ z["R"][i].T
+    rng = np.random.default_rng([i, j])
+    rows1, rows2 = np.flatnonzero(view == i), np.flatnonzero(view == j)
+    _, own, other = np.intersect1d(point[rows1], point[rows2], return_indices=True)
+    taken = rng.permutation(len(own))[:400]
+    x1, x2 = xy[rows1[own[taken]]], xy[rows2[other[taken]]]
+    moved = rng.random(len(x1)) < wrong
+    far, angle = rng.uniform(40.0, 200.0, len(x1)), 0.1 * rng.standard_normal(len(x1))
+    far *= rng.choice([-1.0, 1.0], len(x1))
+    x2 += (moved * far)[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return x1, x2, calibration, turn
+
+
+@pytest.mark.skipif(available()["c"] is not None, reason="NumPy takes long for this")
+def test_sharp_matches_of_a_wall_count_more_than_blunt_ones_beside(data_dir: Path) -> None:
+    """A motion that all agreed with by tens of pixels was taken, with K to hand."""
+    x1, x2, calibration, turn = beside(data_dir / "olsson_house_martenstorget", 3, 4)
+    result = eg.estimate_essential(x1, x2, calibration)
+    assert result.threshold_px < 5.0
+    turned = (np.trace(result.R.T @ turn) - 1.0) / 2.0
+    assert "two motions" in result.flags or np.degrees(np.arccos(min(turned, 1.0))) < 3.0

@@ -98,6 +98,7 @@ def start(
     threshold: float | None,
     score: Array | None,
     seed: int,
+    calibrated: bool = False,
 ) -> tuple[str, Agreement]:
     """Return the geometry to begin from, with the name of what found it.
 
@@ -115,6 +116,8 @@ def start(
         How promising each match is.
     seed : int
         Of everything random.
+    calibrated : bool
+        Whether an essential matrix is looked for, of which a plane leaves two.
 
     Returns
     -------
@@ -123,7 +126,7 @@ def start(
     """
     rng = np.random.default_rng(seed)
     if robust == "native":
-        best = _native(consensus, kernels, score, seed, rng)
+        best = _native(consensus, kernels, score, seed, rng, calibrated)
     else:
         thresholds = _THRESHOLDS if threshold is None else (threshold,)
         found = _of_package(consensus, robust, thresholds, seed)
@@ -141,6 +144,7 @@ def _native(
     score: Array | None,
     seed: int,
     rng: np.random.Generator,
+    calibrated: bool,
 ) -> Agreement | None:
     """Search at the noise of good detectors, and at more of it where that may not be the noise.
 
@@ -174,7 +178,8 @@ def _native(
         extent = _EXTENT * SCALES[0]
         alike = (consensus.judge(own.F, own.sigma, own.share, extent) for own in sharp)
         highest = max(alike, key=lambda own: own.score)
-        if not _is_of_a_plane(kernels, q1, q2, highest, few):
+        # A plane leaves F open; of the two E that it leaves cheirality chooses.
+        if calibrated or not _is_of_a_plane(kernels, q1, q2, highest, few):
             return highest
     return consensus.heavier(best, agreements)
 

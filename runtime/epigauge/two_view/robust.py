@@ -261,7 +261,9 @@ def estimated(
     consensus = agreed.consensus
     if len(raw.rows) >= 8:
         promise = promise if promise is None else promise[agreed.rows]
-        name, agreement = start(consensus, raw.table, front_end, given, promise, seed)
+        calibrated = calibration is not None
+        how = given, promise, seed, calibrated
+        name, agreement = start(consensus, raw.table, front_end, *how)
     if calibration is not None:
         maps = zip(frame.maps_from_pixels(), calibration, strict=True)
         cameras = (to_units @ K for to_units, K in maps)
