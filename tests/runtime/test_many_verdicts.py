@@ -204,6 +204,16 @@ def test_one_open_point_does_not_spoil_the_rest() -> None:
     assert missing_by_count(seen) == 0
 
 
+@pytest.mark.parametrize("loss", ["linear", "huber"])
+def test_a_view_whose_observations_weigh_nothing_is_undetermined(loss: str) -> None:
+    scene = eg.multi_view_scene(seed=1)
+    own = scene.tracks
+    tracks = eg.Tracks(own.view, own.point, own.xy, weights=(own.view != 2).astype(float))
+    result = eg.bundle_adjust(tracks, loss=loss)
+    assert not result.success
+    assert "undetermined" in result.flags
+
+
 def test_points_behind_cameras_are_counted_whatever_the_signs() -> None:
     truth = many_views.cameras_and_points(5, 60)
     tracks = many_views.observed(truth, 0.0)

@@ -79,7 +79,7 @@ class Seen:
 
     @staticmethod
     def of(tracks: Tracks, found: Reconstruction, rejected: Mask) -> tuple[Seen, int]:
-        """Return what counts, and how many views lost all that would have."""
+        """Return what counts, and how many views have nothing of it."""
         counts = ~rejected & (tracks.weights > 0.0)
         # A point needs two observations to be a part of what is judged.
         lengths = np.bincount(tracks.point[counts], minlength=tracks.n_points)
@@ -90,6 +90,5 @@ class Seen:
             return Seen(tracks.view, tracks.point, *observed, found.P, found.Q, *every), 0
         views, view = np.unique(tracks.view[counts], return_inverse=True)
         points, point = np.unique(tracks.point[counts], return_inverse=True)
-        before = len(np.unique(tracks.view[tracks.weights > 0.0]))
         arrays = tracks.xy[counts], tracks.weights[counts], found.P[views], found.Q[points]
-        return Seen(view, point, *arrays, views, points), before - len(views)
+        return Seen(view, point, *arrays, views, points), tracks.n_views - len(views)
