@@ -363,8 +363,9 @@ class TestWeights:
         disturbed = eg.Tracks(tracks.view, tracks.point, xy, weights=np.where(off, 0.0, 1.0))
         start = eg.initialize(tracks)
         a, b = (eg.bundle_adjust(t, start, ftol=1e-12) for t in (weighted, disturbed))
-        assert a.success
-        assert b.success
+        # The camera of a view without weight is nowhere in particular.
+        assert a.success is b.success is (what != "view")
+        assert ("undetermined" in a.flags) is (what == "view")
         assert a.cost == pytest.approx(b.cost, rel=1e-7)
         on = ~off
         assert a.cost == pytest.approx(0.5 * np.sum(a.fun[on] ** 2), rel=1e-9)

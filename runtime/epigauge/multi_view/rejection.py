@@ -133,7 +133,7 @@ def with_set_aside(
         What can be said against the rest.
     """
     left = strayed(tracks, rejected)
-    flags = ordered((*flags, *["strayed views"][: len(left)]))
+    flags = ordered((*flags, "strayed views") if len(left) else flags)
     verdict = Verdict(flags, found.rank, found.n_behind, found.condition, found.weakest)
     fields = told(verdict, found.status)
     fields["message"] = _told(fields["message"], rejected, left)
