@@ -1,8 +1,6 @@
 /* Whether most points of an image may be on one line: runtime/epigauge/two_view/collinear.py. */
 #include "two_view.h"
 
-#include <math.h>
-
 /* How many threes of points next to one another in the list are on a line: the one in the middle by
    `bound`, over the root of the weight of the first where there are weights, which none is without.
    Three points, not two of them and one again. */

@@ -261,8 +261,7 @@ def estimated(
     consensus = agreed.consensus
     if len(raw.rows) >= 8:
         promise = promise if promise is None else promise[agreed.rows]
-        calibrated = calibration is not None
-        how = given, promise, seed, calibrated
+        how = given, promise, seed, calibration is not None
         name, agreement = start(consensus, raw.table, front_end, *how)
     if calibration is not None:
         maps = zip(frame.maps_from_pixels(), calibration, strict=True)
@@ -344,10 +343,8 @@ class _Raw:
             )
         copies, m = np.searchsorted(rows, first), len(x1)
         x1, x2 = x1[rows], x2[rows]
-        (frame, is_near), table = (
-            condition_raw(x1, x2, least),
-            kernels.table(options.get("backend")),
-        )
+        frame, is_near = condition_raw(x1, x2, least)
+        table = kernels.table(options.get("backend"))
         q = frame.forward(x1, x2)
         consensus = Consensus(table, *q)
         return _Raw(m, rows, copies, x1, x2, table, frame, is_near, q, consensus, least)
