@@ -42,6 +42,7 @@ def line(seed: int, *, n: int = 100, beside: int = 0, wrong: int = 0, noise: flo
     return tuple(np.vstack([x, rng.uniform(0.0, 1000.0, (wrong, 2))]) for x in (x1, x2))
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("entry", ENTRIES)
 @pytest.mark.parametrize(
     ("n", "wrong", "noise"),

@@ -69,6 +69,7 @@ def test_it_is_kept_as_often_as_promised() -> None:
     assert np.mean(np.array(kept)[sure]) > np.mean(np.array(kept)[~sure]) + 0.3
 
 
+@pytest.mark.study
 def test_more_matches_promise_more_and_random_ones_nothing() -> None:
     few, many = (eg.estimate_fundamental(*matches(m, 0.2, 0.7, 5)[:2]) for m in (40, 600))
     assert many.error_px < few.error_px

@@ -271,6 +271,7 @@ def test_a_run_that_did_not_begin_has_flags(evidences) -> None:
     assert diagnose(infinite, 0.0, ambiguous=False) == ("weak geometry",)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("m", [30, 200])
 @pytest.mark.parametrize("reach", [40.0, 80.0, 160.0])
 def test_wrong_matches_near_their_own_place_are_no_geometry(m, reach) -> None:
@@ -284,6 +285,7 @@ def test_wrong_matches_near_their_own_place_are_no_geometry(m, reach) -> None:
             assert not solve(x1, x2).success
 
 
+@pytest.mark.study
 def test_a_wide_noise_is_no_random_motion() -> None:
     """Blunt matches of a scene with relief agree on its geometry as sharp ones do."""
     for seed in range(4):

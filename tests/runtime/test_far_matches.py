@@ -57,6 +57,7 @@ def test_homography_does_not_see_them(away: float) -> None:
         assert np.allclose(_pixels(found, x1[10:]), _pixels(plain.H, x1[10:]), atol=0.05)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     "estimate",
     [

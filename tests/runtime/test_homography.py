@@ -255,6 +255,7 @@ class TestRawMatches:
                 with pytest.raises(eg.ArgumentError, match=name):
                     estimate(x1, x2, **{name: [[1.0], [1.0, 2.0]]})  # type: ignore[operator]
 
+    @pytest.mark.study
     @pytest.mark.parametrize("estimate", [eg.estimate_homography, eg.estimate_fundamental])
     def test_matches_to_one_place_do_not_agree(self, estimate: Any) -> None:
         def verdict(seed: int) -> str:

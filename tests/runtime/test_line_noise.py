@@ -60,6 +60,7 @@ def test_the_model_is_the_simple_one(kind: str) -> None:
         assert found.success
 
 
+@pytest.mark.study
 def test_a_scene_stays_one_under_such_noise() -> None:
     for seed in range(3):
         x1, x2 = matches("general", seed)

@@ -50,6 +50,7 @@ def test_three_points_give_pose_and_focal_length() -> None:
     assert agreed_pose(table, x[:3], X[:3], np.array([900.0]), 3.0) is None
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("guess", [600.0, 1400.0])
 def test_a_scene_grows_from_a_wrong_focal_length(guess: float) -> None:
     tracks, _ = tracks_of(seed=3, noise_px=0.3, wrong=0.05)
@@ -80,6 +81,7 @@ def _tied_by_a_plane(seed: int) -> tuple[eg.Tracks, Images]:
     return eg.Tracks(blank.view, blank.point, xy), images
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("seed", [3])  # no projective scene of all its views is found
 def test_parts_that_share_a_wall_become_one_scene(seed: int) -> None:
     tracks, _ = _tied_by_a_plane(seed)
@@ -89,6 +91,7 @@ def test_parts_that_share_a_wall_become_one_scene(seed: int) -> None:
     assert found.rms_px < 0.4
 
 
+@pytest.mark.study
 def test_what_does_not_hang_together_does_not_grow() -> None:
     tracks, _ = tracks_of(seed=4)
     rng = np.random.default_rng(0)

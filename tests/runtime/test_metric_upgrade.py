@@ -74,6 +74,7 @@ def test_gross_errors_are_set_aside() -> None:
     assert scene.rms_px(kept) < 0.35
 
 
+@pytest.mark.study
 def test_each_view_may_have_its_own_camera() -> None:
     focal = np.array([700.0, 800.0, 950.0, 1100.0, 900.0, 750.0])
     tracks, _ = tracks_of(seed=2, focal=focal)

@@ -268,6 +268,7 @@ class TestCommands:
             assert "no common geometry" in eg.estimate_fundamental(x1, x2).flags
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("noise", [0.0, 0.5])
 def test_a_plane_that_is_a_strip_of_the_image_is_told_among_wrong_matches(noise) -> None:
     """Three points of a strip reach little of it: an F of the plane and two wrong ones hid it."""

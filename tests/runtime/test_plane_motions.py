@@ -81,6 +81,7 @@ def test_a_camera_that_only_turned_or_moved_along_the_normal_leaves_one():
     assert leaves_two_motions(R + 0.3 * np.outer(R @ [0.5, 0.0, 1.0], n), rays)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("wrong", [0, 30])
 def test_a_motion_from_a_plane_is_right_or_told_to_be_one_of_two(wrong):
     outcomes = set()

@@ -507,6 +507,7 @@ def test_a_third_that_is_sharp_counts_among_matches_all_about_it(seed):
     assert error(result.F, scene) < 0.3
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("seed", [4, 5])
 def test_many_matches_of_a_few_points_do_not_decide(seed):
     # An epipole at such a point agrees with all of its matches, and exactly.

@@ -68,6 +68,7 @@ def test_a_pair_that_cannot_be_estimated_is_named_and_does_not_stop_the_others(r
     assert "-9" not in str(batch)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("kind", [ThreadPoolExecutor, ProcessPoolExecutor])
 def test_an_executor_gives_the_same_batch(raw, kind, monkeypatch) -> None:
     monkeypatch.setattr(robust_batch, "_PART", 2)

@@ -188,6 +188,7 @@ def test_a_robust_loss_that_gives_a_view_up_says_so(
         assert found.success != is_wrong
 
 
+@pytest.mark.study
 def test_an_upgrade_tells_of_a_view_of_wrong_matches() -> None:
     scene = eg.multi_view_scene(n_views=8, noise_px=0.3, focal=900.0, seed=3)
     tracks = scene.tracks

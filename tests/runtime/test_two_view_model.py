@@ -119,6 +119,7 @@ def test_one_calibration_alone_is_refused() -> None:
         eg.estimate_essential(x1, x2, None)  # type: ignore[arg-type]
 
 
+@pytest.mark.study
 def test_few_matches_tell_their_model() -> None:
     # Fourteen right ones of twenty, of which any seven fit exactly
     for seed in range(3):
