@@ -1,6 +1,6 @@
 """Metric upgrades: motions that leave intrinsics open, and measured tracks with known cameras.
 
-    python benchmarks/metric_upgrade.py [--trials 50] [--motions axis point]
+    python benchmarks/metric_upgrade.py [--trials 50] [--motions axis point table]
     python benchmarks/metric_upgrade.py --lenses [--trials 50]
     python benchmarks/metric_upgrade.py --data FOLDER [--parts | --published]
 
@@ -26,12 +26,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from calibration import CENTRE, SIZE, tracks_of
 from epigauge.metric.scene import Images, with_all_points
 
-MOTIONS = ("general", "translation", "rotation", "axis", "point")
+MOTIONS = ("general", "translation", "rotation", "axis", "point", "table")
 NAMED = {
     "translation": "pure translation",
     "rotation": "pure rotation",
     "axis": "one rotation axis",
     "point": "one viewing point",
+    "table": "one rotation axis",
 }
 
 

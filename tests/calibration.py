@@ -51,6 +51,10 @@ def poses(motion: str, n: int, rng: np.random.Generator) -> tuple[Array, Array]:
                 C[i] = [np.sin(w[0]) * np.cos(w[1]), np.sin(w[1]), -np.cos(w[0]) * np.cos(w[1])]
                 C[i] *= 6.0
                 R[i] = looking_at(C[i], np.zeros(3), rng.normal(0.0, 0.3))
+            case "table":  # the scene stood on a turntable
+                turn = 0.15 * (i - 0.5 * n)
+                C[i] = 6.0 * np.array([0.97 * np.sin(turn), -0.25, -0.97 * np.cos(turn)])
+                R[i] = looking_at(C[i], np.zeros(3))
     return R, C
 
 

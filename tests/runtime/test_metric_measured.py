@@ -49,10 +49,22 @@ def test_the_scene_leads_to_the_known_optimum_of_fixed_cameras(data_dir: Path) -
     assert found.rms_px < 0.4
 
 
-@pytest.mark.parametrize("name", ["house", "corridor"])
-def test_a_focal_length_that_hangs_on_the_lens_is_no_success(name: str, data_dir: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "views"),
+    [
+        ("house", slice(None)),
+        ("house", slice(5, None)),
+        ("house", slice(3, -3)),
+        ("corridor", slice(None)),
+    ],
+)
+def test_a_focal_length_that_hangs_on_the_lens_is_no_success(
+    name: str, views: slice, data_dir: Path
+) -> None:
     # One axis of rotation: without distortion the same tracks fit another camera as well.
     tracks, size, K = _load(data_dir / name)
+    part = np.isin(tracks.view, np.arange(tracks.n_views)[views])
+    tracks, *_ = eg.Tracks.pruned(tracks.view[part], tracks.point[part], tracks.xy[part])
     found = eg.metric_upgrade(tracks, image_size=size)
     assert not found.success
     assert {"one rotation axis", "critical motion"} <= set(found.flags)

@@ -147,6 +147,29 @@ def test_motions_that_leave_intrinsics_open_are_named(motion: str, flag: str, us
             assert abs(found.focal_px - 900.0) < 4.0 * found.focal_std_px
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_turntable_tells_the_focal_length_no_better_than_without_distortion(seed: int) -> None:
+    tracks, _ = tracks_of("table", seed, n_views=5, n_points=200, noise_px=0.4, bend=-0.15)
+    found = eg.metric_upgrade(tracks, image_size=SIZE)
+    assert {"one rotation axis", "one viewing point"} <= set(found.flags)
+    bent = found.reconstruction
+    params = bent.cameras.params * [1.0, 1.0, 1.0, 0.0]
+    straight = eg.Cameras("SIMPLE_RADIAL", params, bent.cameras.camera_of_view)
+    options = {"refine": tuple(name for name in found.refined if name != "k")}
+    kept = tracks.weighted(np.where(found.rejected, 0.0, 1.0))
+    start = eg.MetricReconstruction(bent.R, bent.t, bent.X, straight)
+    plain = eg.bundle_adjust(kept, start, max_iter=100, **options).reconstruction
+    known = eg.covariance(kept, plain, noise_px=found.noise_px, **options)
+    # Where only the distortion, which is about the principal point here, tells where that is.
+    assert found.focal_std_px > np.sqrt(known.intrinsics(0)[0, 0])
+    assert not found.success
+    # A lens that has none is no worse for what is not known of it.
+    tracks, _ = tracks_of("table", seed, n_views=5, n_points=200, noise_px=0.4)
+    found = eg.metric_upgrade(tracks, image_size=SIZE)
+    assert found.success
+    assert abs(found.focal_px - 900.0) < 3.0 * found.focal_std_px < 0.05 * 900.0
+
+
 def test_general_motions_are_not_flagged() -> None:
     for seed in range(6):
         tracks, _ = tracks_of(seed=seed + 100, noise_px=0.5)

@@ -139,12 +139,14 @@ def beside_the_model(
     return np.asarray(np.sqrt(np.maximum(shift**2 - by_noise, 0.0)))
 
 
-def beside_the_bend(tracks: Tracks, known: MetricCovariance, backend: str | None) -> Array:
-    """Return how far a lens without distortion moves each focal length, beyond what noise would.
+def beside_the_bend(tracks: Tracks, known: MetricCovariance, options: Any) -> Array:
+    """Return what each focal length is uncertain by as far as the distortion alone determines it.
 
     Of most motions a little: the distortion shows in the images themselves. Where views turn about
     one axis, or look at one point, one number trades for the other, and what the distortion is
-    wrong by, as any model of a real lens is, is in the focal length many times over.
+    wrong by, as any model of a real lens is, is in the focal length many times over. So the focal
+    length counts as known no better than without distortion: how far it is from there, and what it
+    is uncertain by there, less the noise by which two estimates differ that have one in the other.
 
     Parameters
     ----------
@@ -152,31 +154,31 @@ def beside_the_bend(tracks: Tracks, known: MetricCovariance, backend: str | None
         What was adjusted, with its weights.
     known : MetricCovariance
         Of the adjustment.
-    backend : str or None
-        Where the formulas are computed.
+    options : dict
+        Of `covariance`, as of the adjustment: what was refined, and the back end.
 
     Returns
     -------
     ndarray, shape (c,)
-        In pixels; infinite where principal points are open without distortion, too.
+        In pixels; infinite where the other intrinsics are open without distortion, too.
     """
     bent = known.reconstruction
     model = camera_model(bent.cameras.model)
-    straight = tuple(name for name in model.adjusted if name[0] in "fc")
-    params = np.where(np.isin(model.params, straight), bent.cameras.params, 0.0)
-    cameras = Cameras(model.name, params, bent.cameras.camera_of_view)
+    straight = np.array([name[0] in "fc" for name in model.params])
+    cameras = Cameras(
+        model.name, np.where(straight, bent.cameras.params, 0.0), bent.cameras.camera_of_view
+    )
     start = MetricReconstruction(bent.R, bent.t, bent.X, cameras)
+    plainly = options | {"refine": tuple(name for name in options["refine"] if name[0] in "fc")}
     try:
-        options: Any = {"refine": straight, "backend": backend}
         # To the end: the valley is long.
-        found = bundle_adjust(tracks, start, max_iter=100, **options)
-        plain = found.reconstruction
+        plain = bundle_adjust(tracks, start, max_iter=100, **plainly).reconstruction
         assert isinstance(plain, MetricReconstruction)
-        sure = covariance(tracks, plain, noise_px=known.noise_px, **options)
+        sure = covariance(tracks, plain, noise_px=known.noise_px, **plainly)
     except ArgumentError:
         return np.full(len(cameras), np.inf)
     shift = focal_lengths_of(plain) - focal_lengths_of(bent)
-    by_noise = np.maximum(_focal(known)[1], _focal(sure)[1])
+    by_noise = _focal(known)[1] - _focal(sure)[1]  # negative where only the distortion tells
     return np.asarray(np.sqrt(np.maximum(shift**2 - by_noise, 0.0)))
 
 

@@ -78,7 +78,7 @@ def judged(
         turned = turn_std(known)
     motion = set(motion_flags(found, images, turned))
     if motion & _CRITICAL and known is not None and not search.priors:
-        bent = beside_the_bend(kept, known, backend)
+        bent = beside_the_bend(kept, known, options)
         beside = np.hypot(beside, bent)
         if (bent > WEAK * focal).any():
             flags.add("critical motion")
