@@ -31,8 +31,14 @@ _WRONG = {"no common geometry"}
 #: Flags of a pair that says nothing of where cameras are; its matches make tracks longer only.
 _WITHOUT_PARALLAX = {"planar scene", "pure rotation", "still camera"}
 
+#: Of these, one whose matches say nothing of where points are either, as of a photograph's copy.
+_STILL = "still camera"
+
 #: Pairs that are verified at a time.
 _PART = 64
+
+#: Images of another part that are named at most.
+_LISTED = 5
 
 #: The right matches of a pair must be this many at least, and this share.
 _LEAST, _SHARE = 15, 0.15
@@ -81,6 +87,17 @@ class TrackSource:
     left_out: dict[str, str]
 
 
+@dataclass(frozen=True)
+class _Agreed:
+    """The right matches of a pair, their distances, and whether the camera stood still."""
+
+    distances: Array
+    i: int
+    j: int
+    rows: Indices
+    still: bool
+
+
 def build_tracks(
     images: Sequence[PathLike] | PairwiseMatches | PathLike,
     *,
@@ -96,7 +113,8 @@ def build_tracks(
 
     The matches of each pair are verified by `estimate_fundamental`, and what agrees is merged,
     nearest to its epipolar geometry first. A match that would put two features of one image into
-    one track is left out.
+    one track is left out, and so is a track that is only in images taken from one place in one
+    direction, which leave its depth open.
 
     Parameters
     ----------
@@ -150,7 +168,7 @@ def build_tracks(
             list(images), pairs=pairs, cache=cache, progress=progress, **options
         )
     checked: list[CheckedPair] = []
-    agreed: list[tuple[Array, int, int, Indices]] = []
+    agreed: list[_Agreed] = []
     parallax = False
     for (i, j), rows, (inlier, distances, flags) in _all_verified(found, seed, workers, progress):
         count = int(np.count_nonzero(inlier))
@@ -159,7 +177,7 @@ def build_tracks(
         checked.append(CheckedPair(names, len(rows), count, flags, used))
         if used:
             parallax |= not _WITHOUT_PARALLAX & set(flags)
-            agreed.append((distances[inlier], i, j, rows[inlier]))
+            agreed.append(_Agreed(distances[inlier], i, j, rows[inlier], _STILL in flags))
     source = TrackSource(tuple(checked), {})
     if not agreed:
         raise NoTracks(
@@ -219,16 +237,17 @@ def _best(source: TrackSource) -> str:
     return f"{best.inliers} of {best.matches} matches of {pair} agree"
 
 
-def _merged(
-    found: PairwiseMatches, agreed: list[tuple[Array, int, int, Indices]], source: TrackSource
-) -> Tracks:
+def _merged(found: PairwiseMatches, agreed: list[_Agreed], source: TrackSource) -> Tracks:
     """Return the tracks of the largest part of the images that hangs together."""
     first = np.concatenate([[0], np.cumsum([len(points) for points in found.points])])
-    nodes = np.concatenate([rows + first[[i, j]] for _, i, j, rows in agreed])
-    order = np.argsort(np.concatenate([d for d, *_ in agreed]), kind="stable")
+    nodes = np.concatenate([pair.rows + first[[pair.i, pair.j]] for pair in agreed])
+    order = np.argsort(np.concatenate([pair.distances for pair in agreed]), kind="stable")
     image_of = np.repeat(np.arange(len(found.points)), np.diff(first))
     track_of = _united(nodes[order], image_of)
-    member = np.flatnonzero(track_of >= 0)
+    moved = np.repeat([not pair.still for pair in agreed], [len(pair.rows) for pair in agreed])
+    ends = track_of[nodes[moved]]
+    in_depth = np.unique(ends[ends[:, 0] == ends[:, 1], 0])
+    member = np.flatnonzero((track_of >= 0) & np.isin(track_of, in_depth))
     view, point = image_of[member], track_of[member]
     xy = np.concatenate([np.zeros((0, 2)), *found.points])[member]
     part = _largest_part(view, point, len(found.names))
@@ -246,17 +265,14 @@ def _merged(
         of_rows = np.concatenate([np.zeros((0, 3), np.uint8), *found.colours])[member][keep]
         # `pruned` renumbers: find each observation again by its place.
         colours = _mean_colours(tracks, views, view[keep], xy[keep], of_rows)
-    left_out = {
-        name: _why(name, source)
-        for k, name in enumerate(found.names)
-        if k not in set(views.tolist())
-    }
+    kept = [found.names[k] for k in views]
+    left_out = {name: _why(name, kept, source) for name in found.names if name not in set(kept)}
     return Tracks(
         tracks.view,
         tracks.point,
         tracks.xy,
         source=TrackSource(source.pairs, left_out),
-        names=[found.names[k] for k in views],
+        names=kept,
         sizes=found.sizes[views].astype(np.int64),
         colours=colours,
     )
@@ -325,10 +341,15 @@ def _mean_colours(
     return np.rint(sums / np.bincount(tracks.point)[:, None]).astype(np.uint8)
 
 
-def _why(name: str, source: TrackSource) -> str:
+def _why(name: str, kept: list[str], source: TrackSource) -> str:
     """Return why an image has no place among the tracks."""
     own = [pair for pair in source.pairs if name in pair.images]
-    if not any(pair.used for pair in own):
+    used = [pair for pair in own if pair.used]
+    if not used:
         most = max((pair.inliers for pair in own), default=0)
         return f"agrees with no other image: at most {most} matches have one geometry"
-    return "too few points in common with the others"
+    others = {other for pair in used for other in pair.images} - {name}
+    if others & set(kept):
+        return "too few points in common with the others"
+    listed = ", ".join(sorted(others)[:_LISTED]) + (" ..." if len(others) > _LISTED else "")
+    return f"belongs to a part of its own, with {listed}"
