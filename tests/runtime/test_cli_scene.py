@@ -10,20 +10,26 @@ from pathlib import Path
 import epigauge as eg
 import numpy as np
 import pytest
+from calibration import SIZE, tracks_of
 from colmap_databases import Project
 
 pytest.importorskip("typer", reason="the command line needs typer")
 pytest.importorskip("rich", reason="the command line needs rich")
 pytest.importorskip("cv2", reason="photographs need OpenCV")
 
-from epigauge.cli.scene import _photographs
+from epigauge.cli.scene import _photographs, _with_exif
 
 
 def test_a_database_becomes_a_scene(run, tmp_path: Path) -> None:
     database = Project(n_views=4, n_points=150).write(tmp_path / "database.db")
     output = tmp_path / "scene"
+    output.mkdir()
+    place = output.stat().st_ino
     code, _, err = run("scene", database, "-o", output)
     assert code == 0, err
+    # An empty folder is filled, not replaced: a shell may stand in it.
+    assert output.stat().st_ino == place
+    assert not list(output.glob(".*"))
     report = json.loads((output / "report.json").read_text())
     assert report["photographs"] == ["1.jpg", "2.jpg", "3.jpg", "4.jpg"]
     assert report["left_out"] == {}
@@ -99,6 +105,45 @@ def test_bad_input_ends_with_two(run, tmp_path: Path) -> None:
     code, _, err = run("scene", poster, poster, "--cache", tmp_path / "no" / "c.npz", "-o", output)
     assert code == 2
     assert "no: No such file or directory" in err
+
+
+def test_a_folder_that_cannot_be_made_is_named_before_any_work(run, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    code, _, err = run("scene", tmp_path / "no.jpg", "-o", tmp_path / "file" / "scene")
+    assert code == 2
+    assert "file: cannot be written (Not a directory)" in err
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_photographs_that_are_not_there_are_named(run, tmp_path: Path) -> None:
+    code, _, err = run("scene", tmp_path / "photos", "-o", tmp_path / "scene")
+    assert code == 2
+    assert "photos: No such file or directory" in err
+
+
+def test_each_photograph_is_taken_once_and_notes_of_systems_are_not(tmp_path: Path) -> None:
+    for name in ("a.jpg", "b.jpg", "._a.jpg", ".DS_Store"):
+        (tmp_path / name).touch()
+    (tmp_path / "c.jpg").symlink_to(tmp_path / "b.jpg")
+    found = _photographs([tmp_path / "b.jpg", tmp_path, tmp_path / "a.jpg"])
+    assert [path.name for path in found] == ["b.jpg", "a.jpg"]
+
+
+def test_focal_lengths_that_photographs_tell_can_be_wrong() -> None:
+    tracks, _ = tracks_of(n_views=4, noise_px=0.3, seed=3)
+    tracks = eg.Tracks(tracks.view, tracks.point, tracks.xy, sizes=np.tile(SIZE, (4, 1)))
+    how = tracks, "auto", "SIMPLE_RADIAL", 1
+    right, text = _with_exif(np.full(4, 950.0), *how)
+    assert text == "focal lengths of 4 of 4 photographs"
+    assert right.success
+    wrong, text = _with_exif(np.full(4, 5000.0), *how)
+    assert text == "focal lengths of 4 of 4 photographs, 4 of them contradicted by what is seen"
+    assert wrong.success
+    mixed, text = _with_exif(np.array([900.0, 9000.0, np.nan, 120.0]), *how)
+    assert text == "focal lengths of 3 of 4 photographs, not used: with them there is no scene"
+    assert mixed.success
+    for result in (right, wrong, mixed):
+        assert abs(result.focal_px - 900.0) < 4.0 * result.focal_std_px < 0.1 * 900.0
 
 
 @pytest.mark.parametrize("ending", [".JPG", ".heic"])

@@ -57,6 +57,8 @@ _WHY = {
     "pure rotation": "show no parallax: the camera turned in one place, or all it saw is flat",
     "pure translation": "are by a camera that never turned: every focal length explains them",
     "critical motion": "go about the scene in a way that leaves the focal length open",
+    "undetermined": "determine no scene: too few points in common, or matches that contradict "
+    "one another",
 }
 
 _DATABASES = (".db", ".sqlite", ".sqlite3")
@@ -117,8 +119,7 @@ def scene(
     nothing is written.
     """
     as_choice("--cameras", cameras, get_args(CameraGroups))
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise ArgumentError("--output", f"exists: {shown(output)}", "a new or an empty folder")
+    _check_output(output)
     if exif_focal and _is_database(sources):
         raise ArgumentError("--exif-focal", "is given with a database", "photographs")
     if cache is not None:
@@ -134,13 +135,16 @@ def scene(
                 photographs = dict(zip(names_of(found), found, strict=True))
             tracks = build_tracks(found, progress=told, workers=workers, **options)
             told("cameras", 0, 1)
-            focal = _exif_focal(tracks, photographs) if exif_focal else None
-            result = _upgraded(tracks, cameras, camera, focal, workers)
+            how = tracks, cameras, camera, workers
+            if exif_focal:
+                result, exif = _with_exif(_exif_focal(tracks, photographs), *how)
+            else:
+                result, exif = _upgraded(None, *how), None
     except NoTracks as error:
         out.print(f"[bold red]no scene:[/] the photographs {escape(error.was)}", soft_wrap=True)
         out.print(f"needed: {escape(error.needed)}", soft_wrap=True)
         return NOT_CONVERGED
-    answer = _Answer(tracks, result, photographs, time.perf_counter() - begin, focal)
+    answer = _Answer(tracks, result, photographs, time.perf_counter() - begin, exif)
     answer.report(out)
     if not result.success:
         return NOT_CONVERGED
@@ -161,13 +165,34 @@ def _photographs(sources: list[Path]) -> list[Path]:
     paths: list[Path] = []
     for source in sources:
         if source.is_dir():
-            inside = sorted(p for p in source.iterdir() if p.suffix.lower() in _PHOTOS)
+            # Hidden files are notes that systems make beside photographs.
+            inside = sorted(
+                p
+                for p in source.iterdir()
+                if p.suffix.lower() in _PHOTOS and not p.name.startswith(".")
+            )
             if not inside:
                 raise FileFormatError(source, f"holds no photographs ({', '.join(_PHOTOS)})")
             paths += inside
         else:
+            source.stat()  # an error where it is not there
             paths.append(source)
-    return paths
+    once: dict[Path, Path] = {}
+    for path in paths:
+        once.setdefault(path.resolve(), path)
+    return list(once.values())
+
+
+def _check_output(output: Path) -> None:
+    """Check, before a run that may be long, that a folder can be made or filled."""
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise ArgumentError("--output", f"exists: {shown(output)}", "a new or an empty folder")
+    place = next(p for p in (output.absolute(), *output.absolute().parents) if p.exists())
+    try:
+        with tempfile.TemporaryDirectory(prefix=".scene.", dir=place):
+            pass
+    except OSError as error:
+        raise OSError(error.errno, f"cannot be written ({error.strerror})", str(place)) from None
 
 
 class _progress:
@@ -216,11 +241,34 @@ def _priors(focal: Array | None, groups: Indices, camera: str) -> list[eg.Intrin
     return found
 
 
+def _with_exif(
+    focal: Array, tracks: eg.Tracks, cameras: CameraGroups, camera: UpgradeModel, workers: int
+) -> tuple[eg.MetricUpgrade, str]:
+    """Return the metric scene, and what to say of the focal lengths that photographs tell.
+
+    They can be wrong: of photographs that were cut, or of a lens that was replaced.
+    """
+    result = _upgraded(focal, tracks, cameras, camera, workers)
+    told = np.isfinite(focal)
+    text = f"focal lengths of {np.count_nonzero(told) or 'none'} of {len(focal)} photographs"
+    if not result.success and told.any():
+        other = _upgraded(None, tracks, cameras, camera, workers)
+        if other.success:
+            return other, f"{text}, not used: with them there is no scene"
+    if result.reconstruction is not None:
+        views = result.reconstruction.cameras.camera_of_view[told]
+        found, std = (np.atleast_1d(px)[views] for px in (result.focal_px, result.focal_std_px))
+        sigma = np.hypot(std, _NOMINAL * focal[told])
+        off = np.count_nonzero(np.abs(found - focal[told]) > 3.0 * sigma)
+        text += f", {off} of them contradicted by what is seen" if off else ""
+    return result, text
+
+
 def _upgraded(
+    focal: Array | None,
     tracks: eg.Tracks,
     cameras: CameraGroups,
     camera: UpgradeModel,
-    focal: Array | None,
     workers: int,
 ) -> eg.MetricUpgrade:
     """Return the metric scene; with "auto", of own cameras where one does not fit."""
@@ -251,10 +299,10 @@ class _Answer:
         result: eg.MetricUpgrade,
         photographs: dict[str, Path],
         seconds: float,
-        focal: Array | None = None,
+        exif: str | None = None,
     ) -> None:
-        #: Focal lengths that the photographs tell, where they were asked for.
-        self.focal = focal
+        #: What is to say of focal lengths that the photographs tell, where they were asked for.
+        self.exif = exif
         self.tracks, self.result, self.seconds = tracks, result, seconds
         #: Files by the names of the views; none of a database.
         self.photographs = photographs
@@ -284,9 +332,8 @@ class _Answer:
             "photographs": f"{tracks.n_views} of {tracks.n_views + count}",
             "tracks": f"{tracks.n_points} points, {len(tracks)} observations",
         }
-        if self.focal is not None:
-            told = int(np.count_nonzero(np.isfinite(self.focal)))
-            rows["EXIF data"] = f"focal lengths of {told or 'none'} of {tracks.n_views} photographs"
+        if self.exif is not None:
+            rows["EXIF data"] = self.exif
         if result.reconstruction is not None:
             rows |= camera_rows(result, result.reconstruction.cameras)
             rejected = int(np.count_nonzero(result.rejected))
@@ -309,18 +356,25 @@ class _Answer:
             out.print(f"[bold red]no scene:[/] {escape(reason)}", soft_wrap=True)
 
     def write(self, output: Path) -> None:
-        """Write everything into a folder that takes its name only when it is complete."""
+        """Write everything into a folder that takes its name only when it is complete.
+
+        One that is there already may be where a shell stands, or another disk: it is filled by
+        moving complete files.
+        """
+        there = output.is_dir()
         output.absolute().parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=f".{output.name}.", dir=output.absolute().parent))
+        place = output if there else output.absolute().parent
+        folder = Path(tempfile.mkdtemp(prefix=".scene.", dir=place))
         try:
             self._fill(folder)
-            folder.chmod(0o755)
-            if output.exists():
-                output.rmdir()
-            folder.replace(output)
-        except BaseException:
+            if there:
+                for path in sorted(folder.iterdir()):
+                    path.replace(output / path.name)
+            else:
+                folder.chmod(0o755)
+                folder.replace(output)
+        finally:
             shutil.rmtree(folder, ignore_errors=True)
-            raise
 
     def _fill(self, folder: Path) -> None:
         tracks, found = self.result.kept(self.tracks)
