@@ -88,6 +88,22 @@ def test_what_cannot_start_a_scene_is_said(arguments: dict, words: str) -> None:
         eg.build_tracks(matches)
 
 
+@pytest.mark.parametrize(
+    ("images", "words"),
+    [
+        (Path(), "is a folder"),
+        ([np.zeros((50, 50), np.uint8)] * 2, "has no paths"),
+        (None, "has no paths"),
+        (["a.jpg"], "holds 1"),
+        (["a.jpg", "b.jpg", Path("a.jpg")], "twice"),
+    ],
+)
+def test_what_names_no_photographs_is_told_before_any_work(images: object, words: str) -> None:
+    with pytest.raises(eg.ArgumentError, match=words) as error:
+        eg.build_tracks(images)
+    assert error.value.argument == "images"
+
+
 def together(*parts: eg.PairwiseMatches) -> eg.PairwiseMatches:
     """Return matches of images of several scenes."""
     pairs, first = {}, 0

@@ -224,9 +224,8 @@ def match_photographs(
     --------
     >>> eg.match_photographs(["room0.jpg", "room1.jpg", "room2.jpg"])  # doctest: +SKIP
     """
-    paths = [Path(path) for path in images]
-    if len(paths) < 2:
-        raise ArgumentError("images", f"holds {len(paths)}", "two photographs or more")
+    paths = _paths_of(images)
+    names = names_of(paths)
     ratio = as_positive("ratio", ratio)
     max_features = as_count("max_features", max_features, at_least=8)
     listed = None if pairs == "ranked" else _listed(pairs, len(paths))
@@ -260,7 +259,7 @@ def match_photographs(
         own = kept.get("matches", [paths[i], *(paths[j] for j in others)], make)
         matched |= {(i, j): own[str(k)].astype(np.intp) for k, j in enumerate(others)}
     result = PairwiseMatches(
-        names_of(paths),
+        names,
         np.array([own["size"] for own in found]),
         tuple(own["points"] for own in found),
         matched,
@@ -270,6 +269,23 @@ def match_photographs(
         result.save(cache)
     kept.done()
     return result
+
+
+def _paths_of(images: Sequence[PathLike]) -> list[Path]:
+    """Return the paths, of different photographs."""
+    needed = "paths of two photographs or more"
+    if isinstance(images, str | os.PathLike):
+        raise ArgumentError("images", "is one path", needed)
+    try:
+        paths = [Path(path) for path in images]
+    except TypeError:
+        raise ArgumentError("images", "has no paths", needed) from None
+    if len(paths) < 2:
+        raise ArgumentError("images", f"holds {len(paths)}", needed)
+    once = {path.absolute() for path in paths}
+    if len(once) < len(paths):
+        raise ArgumentError("images", "names a photograph twice", "different photographs")
+    return paths
 
 
 def _cached(cache: Path, paths: list[Path]) -> PairwiseMatches:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -162,11 +163,12 @@ def build_tracks(
     elif isinstance(images, str | os.PathLike):
         from epigauge.io.colmap_matches import database_matches
 
+        if Path(images).is_dir():
+            needed = "paths of its photographs in a list, or a COLMAP database"
+            raise ArgumentError("images", "is a folder", needed)
         found = database_matches(images)
     else:
-        found = match_photographs(
-            list(images), pairs=pairs, cache=cache, progress=progress, **options
-        )
+        found = match_photographs(images, pairs=pairs, cache=cache, progress=progress, **options)
     checked: list[CheckedPair] = []
     agreed: list[_Agreed] = []
     parallax = False
