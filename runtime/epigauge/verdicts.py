@@ -73,6 +73,12 @@ FLAGS = {
         "may be wrong by many pixels",
         "match more points off the plane, and check F there before it is used",
     ),
+    "several planes": Flag(
+        "half as many matches as agree with the homography agree on another one, or some of those "
+        "that agree do so far better with another: it is one of several planes, or between them",
+        "estimate F, whose scene may be in depth; or leave out the matches that agree and estimate "
+        "the next plane, or take a smaller threshold_px",
+    ),
     "pure rotation": Flag(
         "the homography that explains all matches could be that of a camera that only turned; a "
         "plane cannot be excluded",

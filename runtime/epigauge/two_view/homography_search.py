@@ -43,6 +43,7 @@ __all__ = ["PlaneMixture", "estimate_homography"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Rows = NDArray[np.intp]
 
 #: Samples at least and at most, a batch of them, and how many times more than give one clean one.
 _LEAST, _MOST, _BATCH, _PATIENCE = 256, 8192, 64, 20.0
@@ -65,6 +66,12 @@ _FEW, _SHARPEST = 64, 1e-9
 
 #: Steps of the maximisation of the likelihood, and rounds of inliers at most.
 _STEPS, _ROUNDS = 30, 10
+
+#: Another plane is named where so many times the matches agree on it.
+_AS_MANY = 0.5
+
+#: Numbers of nearest matches, about, that are tried for a sharper plane.
+_CORES = 16
 
 
 @dataclass(frozen=True)
@@ -148,7 +155,8 @@ def estimate_homography(
     HomographyResult
         As `refine_homography`, with the inliers. The flag "no common geometry" says that no more
         matches agree than wrong ones would by chance; "undetermined" that all which agree are in
-        one place or on one line of an image, and H, that of all matches, means nothing.
+        one place or on one line of an image, and H, that of all matches, means nothing; "several
+        planes" that half as many others agree on another homography, or some of them far better.
 
     Raises
     ------
@@ -182,10 +190,12 @@ def estimate_homography(
     y1, y2 = x1[rows], x2[rows]
     frame, is_near = condition_raw(y1, y2, LEAST)
     table, (q1, q2) = kernels.table(known.get("backend")), frame.forward(y1, y2)
-    order = ranked(table, q1, q2)
-    if promise is not None:
-        order = np.argsort(-promise[rows], kind="stable")
-    H = _searched(table, q1, q2, order, np.random.default_rng(seed))
+    order = _in_any_order(q1, q2)
+    if promise is None:
+        order = order[ranked(table, *(np.ascontiguousarray(q[:, order]) for q in (q1, q2)))]
+    else:
+        order = order[np.argsort(-promise[rows[order]], kind="stable")]
+    H = sharp = _searched(table, q1, q2, order, np.random.default_rng(seed))
     mixture = PlaneMixture.of(plane_squares(table, H, q1, q2), SCALES[0])
     result, limit = None, 0.0
     tried: set[bytes] = set()
@@ -222,7 +232,19 @@ def estimate_homography(
     chance = chance_on_plane(table, H, q1, q2, bound)
     alarms = log10_false_alarms(len(rows), agreed, chance, LEAST)
     is_left_open = is_open or is_plane_left_open(table, H, q1, q2, used, bound)
-    flags = ("no common geometry",) * bool(alarms > SIGNIFICANT) + ("undetermined",) * is_left_open
+    squared = plane_squares(table, H, q1, q2)
+    rest = is_near & (squared > bound**2)
+    among = (np.cumsum(rest) - 1)[order[rest[order]]]
+    r1, r2 = (np.ascontiguousarray(q[:, rest]) for q in (q1, q2))
+    sharper = plane_squares(table, sharp, q1, q2)
+    is_one_of_several = _is_between_planes(
+        sharper[used], squared[used], mixture.sigma
+    ) or _has_another(table, r1, r2, among, agreed, bound, seed)
+    told = {
+        "no common geometry": alarms > SIGNIFICANT,
+        "undetermined": is_left_open,
+        "several planes": is_one_of_several and alarms <= SIGNIFICANT,
+    }
     if threshold is None and known.get("noise_px") is None and np.isfinite(result.noise_px):
         tails = 1.0 / math.sqrt(_KEPT)  # the threshold has cut them off
         result = replace(
@@ -230,7 +252,7 @@ def estimate_homography(
         )
     agrees = (inlier if is_open else used)[copies]
     result = replace(result, inlier=agrees, used=rows[used], threshold_px=limit * frame.scale)
-    return with_flags(result, flags)
+    return with_flags(result, tuple(name for name, raised in told.items() if raised))
 
 
 def _agreements(squared: Array) -> Array:
@@ -261,8 +283,52 @@ def _likelihoods(squared: Array) -> Array:
     return np.asarray(np.max(logs, axis=1, initial=-np.inf))
 
 
+def _in_any_order(q1: Array, q2: Array) -> Rows:
+    """Return the rows of different matches mixed, the same whatever order they are given in."""
+    by_place = np.lexsort((*q1, *q2))
+    return np.asarray(by_place[np.random.default_rng(0).permutation(len(by_place))])
+
+
+def _has_another(
+    table: Table, q1: Array, q2: Array, order: Rows, agreed: int, bound: float, seed: int
+) -> bool:
+    """Tell whether other matches agree on a plane of their own, nearly as many as on the best."""
+    m, enough = q1.shape[1], max(math.ceil(_AS_MANY * agreed), LEAST + 1)
+    if m < enough:
+        return False
+    most = _PATIENCE * (m / enough) ** 4
+    H = _searched(table, q1, q2, order, np.random.default_rng(seed), most)
+    count = int(np.count_nonzero(plane_squares(table, H, q1, q2) <= bound**2))
+    chance = chance_on_plane(table, H, q1, q2, bound)
+    return count >= enough and log10_false_alarms(m, count, chance, LEAST) <= SIGNIFICANT
+
+
+def _is_between_planes(sharp: Array, squares: Array, sigma: float) -> bool:
+    """Tell whether some of the matches that agree do so far better with another homography.
+
+    With normal noise as many would be as near to one homography by an accident: what lies between
+    planes takes their distances for noise. Where they are as near to the one found, the noise has
+    heavy tails.
+    """
+    n = len(sharp)
+    nearest, own = np.sort(sharp), np.sort(squares)
+    for k in range(LEAST + 1, n + 1, max(n // _CORES, 1)):
+        chance = -math.expm1(-0.5 * float(nearest[k - 1]) / sigma**2)
+        if (
+            log10_false_alarms(n, k, chance, LEAST) <= SIGNIFICANT
+            and np.searchsorted(own, nearest[k - 1], "right") <= _AS_MANY * k
+        ):
+            return True
+    return False
+
+
 def _searched(
-    table: Table, q1: Array, q2: Array, order: NDArray[np.intp], rng: np.random.Generator
+    table: Table,
+    q1: Array,
+    q2: Array,
+    order: Rows,
+    rng: np.random.Generator,
+    most: float = _MOST,
 ) -> Array:
     """Return the best homography of samples, fitted to the matches around."""
     m = q1.shape[1]
@@ -271,7 +337,7 @@ def _searched(
     ]
     j1, j2 = (np.ascontiguousarray(q[:, judges]) for q in (q1, q2))
     pool = np.maximum(min(8, m), np.resize(_POOLS, _BATCH) * m).astype(int)
-    best, highest, done, needed = np.eye(3) / 3.0**0.5, -np.inf, 0, float(_MOST)
+    best, highest, done, needed = np.eye(3) / 3.0**0.5, -np.inf, 0, min(most, _MOST)
     while done < needed:
         rows = order[(rng.random((_BATCH, 4)) * pool[:, None]).astype(int)]
         samples = (np.ascontiguousarray(q[:, rows].transpose(0, 2, 1)) for q in (q1, q2))
@@ -292,7 +358,7 @@ def _searched(
         highest = float(np.max(scores))
         best, fitted = _improved(table, finalists[int(np.argmax(scores))], q1, q2, best)
         near = np.count_nonzero(plane_squares(table, best, q1, q2) <= (3.0 * SCALES[0]) ** 2)
-        needed = min(max(_PATIENCE * (m / max(near, 4.0)) ** 4, _LEAST), _MOST)
+        needed = min(max(_PATIENCE * (m / max(near, 4.0)) ** 4, _LEAST), most, _MOST)
         highest = max(highest, fitted)
     return np.asarray(best)
 
