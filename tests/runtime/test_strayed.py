@@ -191,7 +191,8 @@ def test_a_robust_loss_that_gives_a_view_up_says_so(
 @pytest.mark.study
 def test_an_upgrade_tells_of_a_view_of_wrong_matches() -> None:
     scene = eg.multi_view_scene(n_views=8, noise_px=0.3, focal=900.0, seed=3)
-    tracks = scene.tracks
+    seen, middle = scene.tracks, np.array([400.0, 300.0])
+    tracks = eg.Tracks(seen.view, seen.point, seen.xy + middle)
     found = eg.metric_upgrade(with_one_mixed(tracks, 4, 0.7), image_size=(800, 600))
     assert not found.success
     assert "strayed views" in found.flags

@@ -167,6 +167,29 @@ class CameraModel:
             h[:2, ~(off <= _MISSED * np.maximum(1.0, np.abs(pixels).max(axis=0)))] = np.nan
             return h[:2], _inverses(slope[:, :2].transpose(2, 0, 1))
 
+    def on_axis(self, params: Array) -> tuple[Array, Array]:
+        """Return what a unit of slope is near the optical axis, in pixels, and which way it goes.
+
+        Parameters
+        ----------
+        params : ndarray, shape (n, k)
+            One row a camera.
+
+        Returns
+        -------
+        focal, sense : ndarray, shape (n,), (n,)
+            Geometric mean of both directions of the image; 1 where the camera looks along +z,
+            -1 where along -z.
+        """
+        columns = np.ascontiguousarray(params.T)
+        axis = np.repeat(np.array([[0.0], [0.0], [1.0]]), len(params), axis=1)
+        pose = np.repeat(np.eye(3, 4).reshape(-1, 1), len(params), axis=1)
+        with np.errstate(all="ignore"):
+            slope = self.kernel("image")(axis, columns)[1]
+            depths = self.seen(np.concatenate([pose, columns]), axis)[1]
+            area = slope[0, 0] * slope[1, 1] - slope[0, 1] * slope[1, 0]
+        return np.sqrt(np.abs(area)), np.where(depths > 0.0, 1.0, -1.0)
+
 
 def _inverses(a: Array) -> Array:
     """Return inverses of 2x2 matrices, not finite where there are none."""

@@ -115,12 +115,13 @@ def bundle_adjust(
         last for all others.
     robust : bool
         For measured tracks with gross errors: begin from what most observations agree on
-        (``initialize(tracks, robust=True)``), adjust with a Cauchy loss, set aside what is beyond
-        six standard deviations of the noise, and adjust the rest with the `loss` asked for, until
-        the same is set aside again. A view that would lose most of its observations is first found
-        anew from the points that others hold; the flag "strayed views" says that it lost them all
-        the same. What was set aside is told in `rejected`; it has no part in cost, RMS,
-        flags and rank. Counts and history are those of the last adjustment.
+        (``initialize(tracks, robust=True)``), adjust with a Cauchy loss, from points where most
+        of their lines of sight meet, set aside what is beyond six standard deviations of the
+        noise, and adjust the rest with the `loss` asked for, until the same is set aside again. A
+        view that would lose most of its observations is first found anew from the points that
+        others hold; the flag "strayed views" says that it lost them all the same. What was set
+        aside is told in `rejected`; it has no part in cost, RMS, flags and rank. Counts and
+        history are those of the last adjustment.
     loss : {"linear", "huber", "soft_l1", "cauchy", "truncated"}
         Loss of each squared residual. A robust one weighs gross errors down from a start that is
         not bent by them; see `robust` for one that finds it.
@@ -215,7 +216,10 @@ def bundle_adjust(
             return adjusted_points(tracks, start, how, table, noise_px=noise_px, **free)
 
         last = way.loss, way.loss_scale_px
-        held = fixed_indices("fixed_views", free["fixed_views"], tracks.n_views)
+        held = (
+            fixed_indices("fixed_views", free["fixed_views"], tracks.n_views),
+            fixed_indices("fixed_points", free["fixed_points"], tracks.n_points),
+        )
         return without_gross_errors(again, tracks, start, table, last, held)
 
     if unit is None:

@@ -7,6 +7,7 @@ loss.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,15 +16,16 @@ from numpy.typing import NDArray
 from epigauge.bundle.backends import linearizer_for
 from epigauge.bundle.linearizer import PointRefinement
 from epigauge.bundle.observations import ObservationGraph
-from epigauge.cameras import camera_model
+from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.kernels import Table
+from epigauge.multi_view.tracks import Tracks
 from epigauge.scatter import spread
 from epigauge.two_view.conditioning import condition_raw
 from epigauge.two_view.consensus import Consensus
 from epigauge.two_view.losses import Loss
 
-__all__ = ["agreed_camera", "agreed_fundamental", "agreed_points"]
+__all__ = ["agreed_camera", "agreed_fundamental", "agreed_points", "agreed_positions"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -137,6 +139,7 @@ def agreed_points(
     P: Array,
     Q: Array,
     scale: float,
+    possible: Callable[[Array], Mask] | None = None,
 ) -> Array:
     """Return points, each where a pair of its lines of sight meets if that suits the others more.
 
@@ -152,6 +155,8 @@ def agreed_points(
         Cameras, and points to begin from.
     scale : float
         Distance, in the unit of the problem, at which an observation is doubtful: one loss for all.
+    possible : callable, optional
+        Tells which of points (m, 4) can be proposed; by default all.
 
     Returns
     -------
@@ -178,8 +183,63 @@ def agreed_points(
             proposed = pair.intersect(cameras)
         costs = _finite(judge.point_costs(cameras, proposed))
         better = costs < least
+        better &= True if possible is None else possible(proposed)
         best, least = np.where(better[:, None], proposed, best), np.where(better, costs, least)
     return judge.refine_points(cameras, np.ascontiguousarray(best), PointRefinement())[0]
+
+
+def agreed_positions(
+    kernels: Table,
+    tracks: Tracks,
+    graph: ObservationGraph,
+    found: MetricReconstruction,
+    scale_px: float,
+) -> Array:
+    """Return points of a metric scene, each where most of its lines of sight want it.
+
+    Lines of sight are those of the cameras without distortion; only points in front of all views
+    that see them are taken.
+
+    Parameters
+    ----------
+    kernels : Table
+        Back end.
+    tracks, graph : Tracks, ObservationGraph
+        Observations, and which belongs to what.
+    found : MetricReconstruction
+        Cameras, and points to begin from.
+    scale_px : float
+        Distance, in pixels, at which an observation is doubtful.
+
+    Returns
+    -------
+    ndarray, shape (m, 3)
+        Points; those that nothing better is found of are as they were.
+    """
+    model = camera_model(found.cameras.model)
+    of_views = found.cameras.of_views
+    focal, sense = model.on_axis(of_views)
+    unit = float(np.median(focal))
+    focal, ahead = focal / unit, sense[tracks.view]
+    params = np.ascontiguousarray(of_views[tracks.view].T)
+    h, _ = model.directions(np.ascontiguousarray(tracks.xy.T), params)
+    known = np.isfinite(h).all(axis=0)
+    q = np.ascontiguousarray(np.where(known, focal[tracks.view] * h, 0.0))
+    weights = np.where(known, tracks.weights, 0.0)
+    P = np.concatenate([found.R, found.t[:, :, None]], axis=2)
+
+    def possible(Q: Array) -> Mask:
+        depths = np.einsum("nj,nj->n", P[tracks.view, 2], Q[tracks.point]) * Q[tracks.point, 3]
+        hidden = (weights > 0.0) & ~(ahead * depths > 0.0)
+        return np.asarray(np.bincount(tracks.point[hidden], minlength=len(Q)) == 0)
+
+    Q = np.column_stack([found.X, np.ones(len(found.X))])
+    cameras = P * np.stack([focal, focal, np.ones(len(focal))], axis=1)[:, :, None]
+    Q = agreed_points(kernels, graph, q, weights, cameras, Q, scale_px / unit, possible)
+    with np.errstate(all="ignore"):
+        X = Q[:, :3] / Q[:, 3:]
+    taken = possible(Q) & np.isfinite(X).all(axis=1)
+    return np.where(taken[:, None], X, found.X)
 
 
 def _finite(costs: Array) -> Array:

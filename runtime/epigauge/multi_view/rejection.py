@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from epigauge.bundle.observations import ObservationGraph
+from epigauge.cameras import MetricReconstruction
 from epigauge.kernels import Table
-from epigauge.multi_view.agreement import agreed_points
+from epigauge.multi_view.agreement import agreed_points, agreed_positions
 from epigauge.multi_view.frame import Frame
 from epigauge.multi_view.gauge import normalized
 from epigauge.multi_view.reconstruction import Reconstruction
@@ -52,6 +53,8 @@ _ANEW, _LISTED = 3, 5
 _SETTLED = 1e-3
 
 
+_NONE = np.zeros(0, np.intp)
+
 #: A point is at the centre of a camera where its image, both of unit norm in the normalised basis,
 #: is this small.
 _AT_CENTRE = 1e-3
@@ -72,7 +75,7 @@ def without_gross_errors(
     start: Any,
     kernels: Table,
     loss: tuple[str, float | str],
-    fixed_views: Indices,
+    fixed: tuple[Indices, Indices],
 ) -> BundleResult:
     """Adjust tracks some of which are wrong.
 
@@ -88,16 +91,16 @@ def without_gross_errors(
         Backend.
     loss : tuple
         Name and scale of the loss of the last adjustments, of the observations that are kept.
-    fixed_views : ndarray of int
-        Views that stay where they are.
+    fixed : tuple of ndarray of int
+        Views and points that stay where they are.
 
     Returns
     -------
     BundleResult
         The last adjustment, with what was set aside in `rejected`.
     """
-    search = GrossErrors(tracks, kernels)
-    found = search.settled(lambda start: _agreed(adjust, search, start), start, fixed_views)
+    search = GrossErrors(tracks, kernels, fixed[1])
+    found = search.settled(lambda start: _agreed(adjust, search, start), start, fixed[0])
     if found.status == -2:
         return found
     start, rejected = found.reconstruction, search.gross(found.reconstruction)
@@ -142,6 +145,8 @@ def with_set_aside(
 
 def _agreed(adjust: Adjust, search: GrossErrors, start: Any) -> BundleResult:
     """Adjust with a robust loss until the median distance stays the same."""
+    typical, proposed = search.typical(start), search.agreed(start)
+    start = proposed if search.typical(proposed) < typical else start
     typical = np.inf
     for _ in range(_ROBUST_ROUNDS):
         found = adjust(search.tracks, start, loss="cauchy", loss_scale_px="auto")
@@ -172,10 +177,12 @@ class GrossErrors:
         Observations.
     kernels : Table
         Backend.
+    fixed_points : ndarray of int
+        Points that stay where they are.
     """
 
-    def __init__(self, tracks: Tracks, kernels: Table) -> None:
-        self.tracks, self.frame = tracks, Frame.of(tracks)
+    def __init__(self, tracks: Tracks, kernels: Table, fixed_points: Indices = _NONE) -> None:
+        self.tracks, self.frame, self.fixed_points = tracks, Frame.of(tracks), fixed_points
         self.counts = tracks.weights > 0.0
         graph = ObservationGraph(tracks.view, tracks.point, tracks.n_views, tracks.n_points)
         q, weights = self.frame.conditioned(tracks), np.asarray(tracks.weights)
@@ -193,15 +200,20 @@ class GrossErrors:
         return median(self.distances(found)[self.counts])
 
     def agreed(self, found: Any) -> Any:
-        """Return the reconstruction with points where most of their observations want them.
-
-        Metric ones stay as they are: points that are proposed would be on any side of the cameras.
-        """
+        """Return the reconstruction with points where most of their observations want them."""
+        usual = max(self.typical(found) / _MEDIAN, 1e-12 * self.frame.scale)
+        scale, stays = EFFICIENT["cauchy"] * usual, self.fixed_points
+        if isinstance(found, MetricReconstruction):
+            kernels, graph = self.parts[:2]
+            X = agreed_positions(kernels, self.tracks, graph, found, scale)
+            X[stays] = found.X[stays]
+            return replace(found, X=X)
         if not isinstance(found, Reconstruction):
             return found
-        scale = EFFICIENT["cauchy"] * max(self.typical(found) / _MEDIAN / self.frame.scale, 1e-12)
         P = self.frame.cameras_in(found.P)
-        return Reconstruction(found.P, agreed_points(*self.parts, P, found.Q, scale))
+        Q = agreed_points(*self.parts, P, found.Q, scale / self.frame.scale)
+        Q[stays] = found.Q[stays]
+        return Reconstruction(found.P, Q)
 
     def gross(self, found: Any, fun: Array | None = None) -> Mask:
         """Return which observations are gross errors, or all that is left of a point to one.

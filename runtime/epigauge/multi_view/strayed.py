@@ -127,14 +127,12 @@ def _seen_anew(
         P[view] = resect(kernels, q, Q, agreed_camera(q, Q))
         return Reconstruction(frame.cameras_out(P), found.Q)
     model, params = camera_model(found.cameras.model), found.cameras.of_views[view]
-    ahead = np.concatenate([np.eye(3, 4).ravel(), params])[:, None]
-    along = float(model.seen(ahead, np.array([[0.0], [0.0], [1.0]]))[1][0])
+    (f,), (along,) = model.on_axis(params[None])
     h, _ = model.directions(tracks.xy[rows].T, np.tile(params[:, None], len(rows)))
     sees = np.isfinite(h).all(axis=0)
     turn = np.eye(3) if along > 0.0 else _HALF_TURN
     # Of the plane one away behind the camera, seen through its centre
     rays = (h if along > 0.0 else h * [[-1.0], [1.0]])[:, sees]
-    f = float(params[list(model.focal)].mean())
     pose = agreed_pose(kernels, f * rays.T, found.X[points[sees]], np.array([f]), limit)
     if pose is None:
         return found
