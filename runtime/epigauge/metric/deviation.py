@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from epigauge.bundle.prior_kinds import IntrinsicPrior
 from epigauge.cameras import Cameras, MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
+from epigauge.metric.usual import BEND_KNOWN, CENTRE_KNOWN
 from epigauge.multi_view.adjust import bundle_adjust
 from epigauge.multi_view.tracks import Tracks
 from epigauge.multi_view.uncertainty import covariance
@@ -43,10 +44,6 @@ _SHIFTED = 1e-4
 
 #: Views of a camera that determine the richer model, at least.
 _VIEWS = 4
-
-#: Intrinsics are refined if their standard deviations are below this share of width plus height
-#: (principal points), and this number (coefficients of distortion); others are known to as much.
-CENTRE_KNOWN, BEND_KNOWN = 0.02, 0.1
 
 #: Noise below this share of width plus height is rounding, which hangs together as it likes.
 _EXACT = 1e-6

@@ -15,15 +15,13 @@ from numpy.typing import NDArray
 from epigauge import lm
 from epigauge.kernels import Table
 from epigauge.linear import Dense, Seber
+from epigauge.metric.usual import FOCALS
 from epigauge.multi_view.plausible import basis_of_pair, camera_basis
 
 __all__ = ["Basis", "Views", "metric_bases"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-
-#: Focal lengths tried, in units of width plus height; 0.2 is a very wide lens, 5 a long one.
-_FOCAL = np.geomspace(0.2, 5.0, 14)
 
 #: Usual deviations in the linear equations [1]: of the focal length from the one tried, of the
 #: aspect ratio from one, of the skew from zero, of the principal point, in focal lengths.
@@ -152,7 +150,7 @@ def metric_bases(views: Views) -> list[Basis]:
     if len(views.P) == 2:
         starts = _of_pair(conditioned)
     else:
-        starts = [H for H in (_linear(conditioned, f) for f in _FOCAL) if H is not None]
+        starts = [H for H in (_linear(conditioned, f) for f in FOCALS) if H is not None]
     tried = [basis for basis in (_judged(conditioned, H) for H in starts) if basis.cost < np.inf]
     tried.sort(key=lambda basis: basis.deviation)
     found: list[Basis] = []
@@ -231,7 +229,7 @@ def _of_pair(views: Views) -> list[Array]:
     """
     first = camera_basis(views.P[0])
     second = views.P[1] @ first
-    return [first @ basis_of_pair(P2, f) for P2 in (second, -second) for f in _FOCAL]
+    return [first @ basis_of_pair(P2, f) for P2 in (second, -second) for f in FOCALS]
 
 
 def _judged(views: Views, H: Array) -> Basis:

@@ -13,12 +13,12 @@ from epigauge._options import UpgradeModel
 from epigauge.bundle.prior_kinds import IntrinsicPrior
 from epigauge.cameras import MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
-from epigauge.metric.deviation import BEND_KNOWN, CENTRE_KNOWN
 from epigauge.metric.growth import grown
 from epigauge.metric.quadric import Basis, Views, metric_bases
 from epigauge.metric.samples import Sample
 from epigauge.metric.scene import Images, metric_scene
 from epigauge.metric.turning import turned
+from epigauge.metric.usual import BEND_KNOWN, CENTRE_KNOWN, GUESSES
 from epigauge.multi_view.adjust import BundleResult, bundle_adjust
 from epigauge.multi_view.initialize import initialize
 from epigauge.multi_view.reconstruction import Reconstruction
@@ -38,10 +38,6 @@ _CANDIDATES = 3
 
 #: Metric cameras whose median distance is so many times that of projective ones do not fit.
 _MISFIT = 2.0
-
-#: Focal lengths that a scene grows from where no projective reconstruction leads to a good one, in
-#: units of width plus height.
-_GUESSES = (0.7, 0.4, 1.2)
 
 #: A projective reconstruction is doubted, and sought robustly, where its median distance exceeds
 #: this share of width plus height, or where less of it is in front of some metric cameras.
@@ -182,7 +178,7 @@ class Search:
     def _grown(self, best: Fit | None) -> Fit | None:
         """Return the best of a doubted scene and those that grow from guessed focal lengths."""
         tracks, unit = self.sample.tracks, self.images.unit
-        for share in _GUESSES:
+        for share in GUESSES:
             try:
                 scene = grown(tracks, self.images, self.camera, share * unit, self.options)
             except (ArgumentError, np.linalg.LinAlgError):

@@ -16,6 +16,7 @@ from epigauge.bundle.prior_kinds import IntrinsicPrior, PositionPrior
 from epigauge.cameras import Cameras, MetricReconstruction, camera_model
 from epigauge.errors import ArgumentError
 from epigauge.metric.scene import Images, cameras_of
+from epigauge.metric.usual import BENDS, TURNING_FOCALS
 from epigauge.multi_view.adjust import bundle_adjust
 from epigauge.multi_view.first_pair import MIN_MATCHES, common_points, rows_of
 from epigauge.multi_view.tracks import Tracks
@@ -26,9 +27,6 @@ __all__ = ["Turned", "turned"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-
-#: Focal lengths, in width plus height, and distortions that views are turned onto one another with.
-_FOCAL, _BEND = np.geomspace(0.25, 2.0, 7), np.array([-0.3, -0.15, 0.0, 0.1])
 
 #: Points of a pair of views that this is done by, at most, and rounds of it, each robust by the
 #: distances of the one before.
@@ -141,7 +139,7 @@ def _turned(tracks: Tracks, images: Images, camera: str) -> MetricReconstruction
     model = camera_model(camera)
     bend = next((name for name in ("k", "k1") if name in model.params), None)
     shares, bends = (
-        grid.ravel() for grid in np.meshgrid(_FOCAL, _BEND if bend is not None else [0.0])
+        grid.ravel() for grid in np.meshgrid(TURNING_FOCALS, BENDS if bend is not None else [0.0])
     )
     # In width plus height; a point as far out as f is seen with a bend of k: rays (x, f (1 + k)).
     x = images.points_in(tracks.xy, tracks.view).T
