@@ -111,3 +111,13 @@ def test_fixed_points_stay_among_gross_errors(kind: str) -> None:
     before, after = (s.X if kind == "metric" else s.Q for s in (start, found))
     np.testing.assert_array_equal(after[stay], before[stay])
     assert (after[10:] != before[10:]).any()
+
+
+@pytest.mark.parametrize("loss", ["huber", "soft_l1", "cauchy", "truncated"])
+def test_what_a_robust_loss_gives_up_is_no_noise(loss: str) -> None:
+    clean, true = metric_scene("SIMPLE_RADIAL", 1, n_views=8, n_points=80, noise_px=0.5)
+    xy = clean.xy.copy()
+    xy[::17] += [300.0, -300.0]
+    found = eg.bundle_adjust(eg.Tracks(clean.view, clean.point, xy), true, loss=loss)
+    assert found.success
+    assert found.flags == ()

@@ -93,7 +93,9 @@ def judged_metric(
         else:
             every = evidence.of_views
             raised.update(strayed_flags(evidence.far_of_views, every, usual, scale))
-        noise_px = float(np.sqrt(tail.sum_of_squares / share_free / max(2 * tail.count, 1)))
+        # A robust loss has given up gross errors, which are no noise of what it follows.
+        rms = float(np.sqrt(tail.sum_of_squares / share_free / max(2 * tail.count, 1)))
+        noise_px = rms if bends else usual
         # Affine cameras are computed with in other units of the image.
         noise = noise_px if metric else noise_px / scale
         sizes = tangent_sizes(system)
