@@ -212,3 +212,13 @@ def test_distorted_picture_says_so() -> None:
     frame = replace(display(result.reconstruction, SCENE.tracks), deviation=5.0)
     title = plot_bundle(result, SCENE.tracks, frame=frame).axes[0].get_title(loc="left")
     assert "distorted" in title
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_pieces_of_lines_are_shown_where_their_ends_are_but_for_far_ones(count: int) -> None:
+    frame = display(SCENE.true, SCENE.tracks)
+    pieces = SCENE.true.Q[: 2 * count].reshape(count, 2, 4)
+    far = np.array([[SCENE.true.Q[0], frame.T @ [1e9, 0.0, 0.0, 1.0]]])
+    shown = frame.placed_pieces(np.concatenate([pieces, far]))
+    ends = np.stack([frame.placed(pieces[:, k]) for k in (0, 1)], axis=1)
+    np.testing.assert_allclose(shown, ends, atol=1e-12)

@@ -320,6 +320,27 @@ def test_climbing_goes_on_within_an_extent() -> None:
     assert 0.0008 < end.sigma < 0.0012 < 0.002 < start.sigma
 
 
+def test_searching_again_finds_nothing_better() -> None:
+    """The search ends where the matches that agree lead to no other E, but for a rare scene."""
+    better = 0
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        X = np.column_stack([rng.uniform(-1.0, 1.0, (40, 2)), rng.uniform(3.0, 6.0, 40)])
+        R, t = rotation([0.1, -0.05, 0.2]), np.array([0.5, 0.1, 0.2])
+        q1, q2 = (
+            4.0 * np.ascontiguousarray(pixels(np.eye(3), Y).T)
+            + 0.004 * rng.standard_normal((2, 40))
+            for Y in (X, X @ R.T + t)
+        )
+        q2[:, :28] = rng.uniform(-2.0, 2.0, (2, 28))
+        A = np.diag([4.0, 4.0, 1.0])
+        search = EssentialConsensus(kernels.table(), q1, q2, A, A)
+        found = search.search([search.of_few()], np.random.default_rng(0))
+        again = search.search([found], np.random.default_rng(0))
+        better += again.score > found.score + 0.1
+    assert better <= 1
+
+
 def test_sharp_agreement_counts_beside_repeated_structure(data_dir: Path) -> None:
     """Windows of a facade agree bluntly with an E of their own, which is the likelier one."""
     with np.load(data_dir / "strecha_pairs" / "entry_p10.npz") as z:

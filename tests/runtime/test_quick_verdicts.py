@@ -68,6 +68,18 @@ def test_matches_of_weight_zero_do_not_count() -> None:
 
 
 @needs_c
+@pytest.mark.parametrize("distance", [6.0, 10.0])
+def test_gross_errors_are_left_to_the_diagnosis(distance: float) -> None:
+    for seed in (0, 2):
+        rng = np.random.default_rng(seed)
+        x1, x2 = scene("general", 60, 0.5, rng)
+        x2 = x2.copy()
+        x2[:2] += distance * rng.choice([-1.0, 1.0], (2, 2))
+        assert "gross errors" in eg.refine_fundamental(x1, x2, backend="numpy").flags
+        assert quickly(x1, x2)[0] is None
+
+
+@needs_c
 def test_points_that_many_are_matched_to_count_once() -> None:
     view = eg.two_view_scene(16.0, seed=3)
     x1, x2 = view.x1.copy(), view.x2.copy()

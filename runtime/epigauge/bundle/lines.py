@@ -192,8 +192,7 @@ def sized_lines(lines: Array, model: CameraModel) -> Array:
             lines = lines / np.linalg.norm(lines[:, 3:], axis=1, keepdims=True)
             n, v = lines[:, :3], lines[:, 3:]
             return np.concatenate([n - np.sum(n * v, axis=1, keepdims=True) * v, v], axis=1)
-        lines = lines / np.linalg.norm(lines, axis=1, keepdims=True)
-        # The nearest on the quadric: n + v and n - v get the same length.
+        # The nearest on the quadric: n + v and n - v get the same length, one, as the whole does.
         n, v = lines[:, :3], lines[:, 3:]
         sides = [side / np.linalg.norm(side, axis=1, keepdims=True) for side in (n + v, n - v)]
         return np.concatenate([sides[0] + sides[1], sides[0] - sides[1]], axis=1) / 2.0
