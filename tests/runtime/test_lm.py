@@ -27,6 +27,21 @@ class BlindDense(Dense):
         return math.inf
 
 
+class Promise(np.ndarray):
+    """A step that knows what decrease of the cost it promises."""
+
+    promised: float
+
+
+class PromisingDense(BlindDense):
+    """A linear system whose steps do."""
+
+    def solve(self, lam: float, *, scaled: bool) -> np.ndarray:
+        step = super().solve(lam, scaled=scaled).view(Promise)
+        step.promised = self.predicted(np.asarray(step))
+        return step
+
+
 @dataclass
 class LeastSquares:
     """0.5 |r(x)|^2 with r and its Jacobian; `cost` overrides the cost of chosen evaluations."""
@@ -455,3 +470,14 @@ def test_a_rejected_step_however_small_its_harm_is_no_convergence(change: float)
     assert not found.history[1].accepted
     assert found.nit > 2
     np.testing.assert_allclose(found.state.x, 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("x0", [[0.0, 0.0], [1.0 + 1e-9, 2.0]])
+def test_a_promise_that_only_damping_made_small_is_no_convergence(x0: list[float]) -> None:
+    """Every trial comes out higher by rounding: far from the minimum that is a failure."""
+    start = linear().evaluate(np.array(x0)).cost
+    problem = linear(system=PromisingDense, cost=lambda k, _: start * (1.0 + 1e-13 * (k > 0)))
+    outcome = minimize(
+        problem, np.array(x0), Levenberg(), Classic(), Stopping(ftol=0.0, xtol=0.0, gtol=0.0)
+    )
+    assert outcome.status == (-1 if x0[0] == 0.0 else 2)
