@@ -57,6 +57,8 @@ _WHY = {
     "pure rotation": "show no parallax: the camera turned in one place, or all it saw is flat",
     "pure translation": "are by a camera that never turned: every focal length explains them",
     "critical motion": "go about the scene in a way that leaves the focal length open",
+    "unlike cameras": "are not all of one camera, or were cut or stretched: cameras with square "
+    "pixels do not explain them",
     "undetermined": "determine no scene: too few points in common, or matches that contradict "
     "one another",
 }
@@ -290,6 +292,12 @@ def _upgraded(
     return result
 
 
+def _reason(result: eg.MetricUpgrade) -> str:
+    """Return why there is no scene, by the first flag that tells."""
+    reasons = [f"the photographs {_WHY[name]}" for name in result.flags if name in _WHY]
+    return reasons[0] if reasons else result.message
+
+
 class _Answer:
     """A scene from photographs and the forms it is given in."""
 
@@ -351,9 +359,7 @@ class _Answer:
         for name, why in left_out.items():
             out.print(f"[bold]left out:[/] {escape(name)} {escape(why)}", soft_wrap=True)
         if not result.success:
-            reasons = [f"the photographs {_WHY[name]}" for name in result.flags if name in _WHY]
-            reason = reasons[0] if reasons else result.message
-            out.print(f"[bold red]no scene:[/] {escape(reason)}", soft_wrap=True)
+            out.print(f"[bold red]no scene:[/] {escape(_reason(result))}", soft_wrap=True)
 
     def write(self, output: Path) -> None:
         """Write everything into a folder that takes its name only when it is complete.
