@@ -116,40 +116,39 @@ def together(*parts: eg.PairwiseMatches) -> eg.PairwiseMatches:
 
 
 def test_images_of_another_scene_are_left_out_with_those_that_they_agree_with() -> None:
-    tracks = eg.build_tracks(together(pairwise(seed=4, n=3)[0], pairwise(seed=5, n=4)[0]))
-    assert tracks.names == ("3.jpg", "4.jpg", "5.jpg", "6.jpg")
+    tracks = eg.build_tracks(together(pairwise(seed=4, n=2)[0], pairwise(seed=5, n=3)[0]))
+    assert tracks.names == ("2.jpg", "3.jpg", "4.jpg")
     assert tracks.source.left_out == {
-        "0.jpg": "belongs to a part of its own, with 1.jpg, 2.jpg",
-        "1.jpg": "belongs to a part of its own, with 0.jpg, 2.jpg",
-        "2.jpg": "belongs to a part of its own, with 0.jpg, 1.jpg",
+        "0.jpg": "belongs to a part of its own, with 1.jpg",
+        "1.jpg": "belongs to a part of its own, with 0.jpg",
     }
 
 
 @pytest.mark.parametrize("moved_px", [0.0, 0.2])
 def test_a_photograph_given_twice_does_no_harm(moved_px: float) -> None:
-    found, _ = pairwise(seed=6, n=4)
+    found, _ = pairwise(seed=6, n=3)
     # Most features of one photograph have a match in its copy, and in no other image.
     rng = np.random.default_rng(0)
-    first = np.vstack([found.points[0], rng.uniform(0.0, 1.0, (400, 2)) * SIZE])
+    first = np.vstack([found.points[0], rng.uniform(0.0, 1.0, (300, 2)) * SIZE])
     copy = first + rng.normal(0.0, 1.0, first.shape) * moved_px
-    pairs = found.pairs | {(j, 4): rows[:, ::-1] for (i, j), rows in found.pairs.items() if i == 0}
-    pairs[0, 4] = np.column_stack([np.arange(len(first))] * 2)
+    pairs = found.pairs | {(j, 3): rows[:, ::-1] for (i, j), rows in found.pairs.items() if i == 0}
+    pairs[0, 3] = np.column_stack([np.arange(len(first))] * 2)
     twice = eg.PairwiseMatches(
-        tuple(f"{k}.jpg" for k in range(5)),
-        np.tile(SIZE, (5, 1)),
+        tuple(f"{k}.jpg" for k in range(4)),
+        np.tile(SIZE, (4, 1)),
         (first, *found.points[1:], copy),
         pairs,
     )
     tracks = eg.build_tracks(twice)
-    assert tracks.n_views == 5
+    assert tracks.n_views == 4
     lengths = np.bincount(tracks.point)
-    in_both = np.isin(tracks.view, (0, 4))
+    in_both = np.isin(tracks.view, (0, 3))
     assert (np.bincount(tracks.point[in_both], minlength=tracks.n_points) < lengths).all()
     result = eg.metric_upgrade(tracks, image_size=SIZE)
     assert result.success
     assert abs(result.focal_px - 900.0) < 4.0 * result.focal_std_px < 0.2 * 900.0
     np.testing.assert_allclose(
-        result.reconstruction.centres[0], result.reconstruction.centres[4], atol=0.02
+        result.reconstruction.centres[0], result.reconstruction.centres[3], atol=0.02
     )
 
 

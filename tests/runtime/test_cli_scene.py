@@ -18,6 +18,8 @@ pytest.importorskip("rich", reason="the command line needs rich")
 pytest.importorskip("cv2", reason="photographs need OpenCV")
 
 from epigauge.cli.scene import _photographs, _reason, _with_exif
+from epigauge.metric.checks import images_of
+from epigauge.metric.result import nothing
 
 
 def test_a_database_becomes_a_scene(run, tmp_path: Path) -> None:
@@ -129,16 +131,20 @@ def test_each_photograph_is_taken_once_and_notes_of_systems_are_not(tmp_path: Pa
     assert [path.name for path in found] == ["b.jpg", "a.jpg"]
 
 
-def test_why_there_is_no_scene_is_said_of_the_photographs() -> None:
-    focal = np.array([900.0, 1400.0, 700.0, 1700.0, 900.0])
-    tracks, _ = tracks_of(n_views=5, noise_px=0.3, seed=3, focal=focal)
-    unlike = eg.metric_upgrade(tracks, image_size=SIZE)
-    assert not unlike.success
-    assert _reason(unlike).startswith("the photographs are not all of one camera")
-    few = tracks.xy + np.random.default_rng(0).normal(0.0, 200.0, tracks.xy.shape)
-    nothing = eg.metric_upgrade(eg.Tracks(tracks.view, tracks.point, few), image_size=SIZE)
-    assert not nothing.success
-    assert _reason(nothing).startswith("the photographs ")
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("weak focal length", "unlike cameras"), "are not all of one camera"),
+        (("undetermined",), "determine no scene"),
+        (("pure rotation", "undetermined"), "show no parallax"),
+    ],
+)
+def test_why_there_is_no_scene_is_said_of_the_photographs(
+    flags: tuple[str, ...], words: str
+) -> None:
+    tracks, _ = tracks_of()
+    result = nothing(tracks, images_of(tracks, SIZE, True), flags)
+    assert _reason(result).startswith(f"the photographs {words}")
 
 
 def test_focal_lengths_that_photographs_tell_can_be_wrong() -> None:
