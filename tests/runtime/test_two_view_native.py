@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from epigauge import kernels, lm
 from epigauge.scenes import two_view_scene
-from epigauge.two_view import native, refine, solve
+from epigauge.two_view import minima, native, refine, solve
 from epigauge.two_view.parameterizations import Ortho
 from two_views import same_geometry
 
@@ -88,6 +88,8 @@ def test_same_course_where_directions_are_left_out_or_mapped(
 ):
     scene = two_view_scene(distance, n_points=40, seed=6)
     options = RESTRICTED[restriction] | {"hessian": hessian, "max_iter": 12}
+    # The course of one start: what is cut off after twelve steps leads to no second one
+    monkeypatch.setattr(minima, "_reversed", lambda *_: None)
     compiled, reference = both(monkeypatch, scene.x1, scene.x2, **options)
     assert compiled.nfev >= 3
     for row, other in zip(compiled.history, reference.history, strict=False):

@@ -7,6 +7,7 @@ epipolar constraint.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -169,6 +170,10 @@ def search(
         found.append(minimize(matches, options, F, callback))
         if found[-1].outcome.status == -2:
             break
+    else:
+        other = _reversed(matches, options, found[0])
+        if other is not None:
+            found.append(minimize(matches, options, other, callback))
     return chosen(matches, options, found)
 
 
@@ -222,6 +227,35 @@ def chosen(matches: Matches, options: Options, found: list[Solution]) -> Search:
     )
     solution = replace(best, outcome=outcome)
     return Search(solution, cases[first], minima, rivals > 1, motions[first])
+
+
+def _reversed(matches: Matches, options: Options, solution: Solution) -> Array | None:
+    """Return a start for calibrated cameras with the relief of the scene reversed, if there is one.
+
+    A narrow field of view hardly tells relief and motion from both mirrored in depth, in the plane
+    through the middle of the points across the line of sight of either camera. What five matches
+    lead to fits exactly.
+    """
+    used = matches.weights > 0.0
+    if options.calibration is None or np.count_nonzero(used) <= Essential.dimension:
+        return None
+    motion = _motion(matches, options, solution)
+    if motion is None or not math.isfinite(_cost(solution)):
+        return None
+    R, t = motion.R, motion.t
+    cameras = matches.calibrated(options.calibration)
+    rays1, rays2 = cameras.rays(matches.q1, matches.q2)
+    across = np.cross(rays1 @ R.T, rays2)
+    with np.errstate(all="ignore"):
+        depths = np.sum(np.cross(rays2, t) * across, axis=1) / np.sum(across**2, axis=1)
+    good = used & (depths > 0.0) & np.isfinite(depths)
+    if not good.any():
+        return None
+    middle1 = np.median(rays1[good] * depths[good, None], axis=0)
+    middle2 = R @ middle1 + t
+    side1, side2 = (np.eye(3) - 2.0 * np.outer(m, m) / (m @ m) for m in (middle1, middle2))
+    turn = side2 @ R @ side1
+    return cameras.fundamental(np.cross(np.eye(3), turn @ middle1 - middle2) @ turn)
 
 
 def _on_a_plane(matches: Matches, m: int, noise: float) -> bool:
