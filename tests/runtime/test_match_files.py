@@ -23,8 +23,8 @@ LONELY = RNG.uniform(-100.0, 100.0, (50, 2)).astype(np.float32)
 KEYPOINTS0 = np.vstack([X1, LONELY[:20]])[FIRST]
 KEYPOINTS1 = np.vstack([X2, LONELY[20:]])[SECOND]
 ROW0, ROW1 = np.argsort(FIRST)[:M], np.argsort(SECOND)[:M]
-MATCHES0 = np.full(M + 20, -1)
-MATCHES0[ROW0] = ROW1
+MATCHES0, MATCHES1 = np.full(M + 20, -1), np.full(M + 30, -1)
+MATCHES0[ROW0], MATCHES1[ROW1] = ROW1, ROW0
 CONFIDENCE = RNG.uniform(size=M)
 
 #: As the programs write them, of `np.savez`.
@@ -50,6 +50,7 @@ FORMS: dict[str, dict[str, Any]] = {
         "keypoints1": KEYPOINTS1,
         "matches0": MATCHES0[None].astype(np.int64),
     },
+    "matches1": {"keypoints0": KEYPOINTS0, "keypoints1": KEYPOINTS1, "matches1": MATCHES1},
     "kornia": {"keypoints0": X1, "keypoints1": X2, "confidence": CONFIDENCE},
     "OpenCV": {"pts1": X1[:, None], "pts2": X2[:, None]},
     "OpenCV, homography": {"src_pts": X1, "dst_pts": X2},
@@ -107,6 +108,14 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "too few rows": (
         {**FORMS["SuperGlue"], "matches": MATCHES0[:-3]},
         "matches has 67 rows, needed: 70, one a keypoint",
+    ),
+    "too few rows of the other image": (
+        {**FORMS["matches1"], "matches1": MATCHES1[:-3]},
+        "matches1 has 77 rows, needed: 80, one a keypoint",
+    ),
+    "too few marks": (
+        {"mkpts0": X1, "mkpts1": X2, "mask": np.ones(M - 1, np.uint8)},
+        "inlier has 49 marks, needed: 50, one a match",
     ),
     "nan": (
         {"mkpts0": np.where(X1 == X1[7], np.nan, X1), "mkpts1": X2},

@@ -5,8 +5,8 @@ Found by name, first come first served:
 - ``x1``, ``x2`` or ``matches`` (m, 4): our own;
 - ``mkpts0``, ``mkpts1``: LoFTR, SuperGlue, RoMa and what follows them; also ``mkpts0_f``;
 - ``keypoints0``, ``keypoints1`` with ``matches`` (k, 2) of LightGlue, or ``matches0`` (or
-  ``matches``) (n,) of SuperGlue and hloc, where -1 is no match; without either they are matches
-  already, as kornia's LoFTR gives them;
+  ``matches``) (n,) of SuperGlue and hloc, where -1 is no match, or ``matches1`` alone, one a
+  keypoint of the other image; without any they are matches already, as kornia's LoFTR gives them;
 - ``pts1``, ``pts2``; ``points1``, ``points2``; ``src_pts``, ``dst_pts``: OpenCV's examples.
 
 A leading batch axis of one, and OpenCV's (m, 1, 2), are dropped. Confidences are not taken for
@@ -44,7 +44,7 @@ GROUPS = (
 #: Names of the marks of inliers.
 MARKS = ("inlier", "inliers", "inlier_mask", "mask")
 #: Names of the rows of keypoints that match.
-LINKS = ("matches", "matches0")
+LINKS = ("matches", "matches0", "matches1")
 
 
 def points_of(path: Path, found: Mapping[str, Array]) -> dict[str, Any]:
@@ -66,9 +66,10 @@ def points_of(path: Path, found: Mapping[str, Array]) -> dict[str, Any]:
     if linked:
         rows = _rows(path, linked[0], found[linked[0]], fields)
         fields["x1"], fields["x2"] = fields["x1"][rows[:, 0]], fields["x2"][rows[:, 1]]
-    marks = [name for name in MARKS if name in found]
+    marks = [_marks(found[name]) for name in MARKS if name in found]
+    marks = [one for one in marks if one.ndim == 1]  # a mask can be that of an image
     if marks:
-        fields["inlier"] = _marks(found[marks[0]])
+        fields["inlier"] = marks[0]
     return fields
 
 
@@ -90,12 +91,13 @@ def _rows(path: Path, name: str, links: Array, points: Mapping[str, Array]) -> A
         reason = f"{name} is {links.dtype} {cut(links.shape)}; needed: rows (k, 2) or (n,)"
         raise FileFormatError(path, reason)
     if links.ndim == 1:
-        if len(links) != len(points["x1"]):
-            reason = f"{name} has {len(links)} rows, needed: {len(points['x1'])}, one a keypoint"
+        own, turn = (points["x2"], -1) if name == "matches1" else (points["x1"], 1)
+        if len(links) != len(own):
+            reason = f"{name} has {len(links)} rows, needed: {len(own)}, one a keypoint"
             raise FileFormatError(path, reason)
         links = links.astype(np.int64)
         first = np.flatnonzero(links >= 0)
-        links = np.column_stack([first, links[first]])
+        links = np.column_stack([first, links[first]])[:, ::turn]
     for side, (which, count) in enumerate((k, len(points[k])) for k in ("x1", "x2")):
         bad = np.flatnonzero((links[:, side] < 0) | (links[:, side] >= count))
         if len(bad):

@@ -102,9 +102,9 @@ def load_matches(
     NPZ: arrays ``x1`` and ``x2`` (m, 2), or ``matches`` (m, 4) with columns x1, y1, x2, y2;
     optionally ``weights`` (m,), ``inlier`` (m,), ``image_size1`` and ``image_size2`` (width,
     height). Or the arrays of other programs: ``mkpts0`` and ``mkpts1`` (LoFTR), ``keypoints0`` and
-    ``keypoints1`` with ``matches`` (k, 2) (LightGlue), ``matches0`` or ``matches`` (n,)
-    (SuperGlue) or as they are (kornia), ``pts1`` and ``pts2`` (OpenCV). Other arrays are not looked
-    at, confidences neither: they are no inverse variances.
+    ``keypoints1`` with ``matches`` (k, 2) (LightGlue), ``matches0``, ``matches1`` or ``matches``
+    (n,) (SuperGlue) or as they are (kornia), ``pts1`` and ``pts2`` (OpenCV). Other arrays are not
+    looked at, confidences neither: they are no inverse variances.
 
     NPY: one array (m, 4), or (2, m, 2). HDF5 (``.h5``, ``.hdf5``): the matches of hloc.
 
@@ -247,6 +247,9 @@ def _matches(path: Path, fields: dict[str, Any], inliers: bool) -> Matches:
         weights = as_weights(fields["weights"], len(x1)) if "weights" in fields else None
     except ArgumentError as error:
         raise FileFormatError(path, str(error)) from None
+    if "inlier" in fields and len(fields["inlier"]) != len(x1):
+        reason = f"inlier has {len(fields['inlier'])} marks, needed: {len(x1)}, one a match"
+        raise FileFormatError(path, reason)
     keep = _inlier_mask(path, fields, len(x1)) if inliers else slice(None)
     return Matches(
         np.array(x1[keep]),
