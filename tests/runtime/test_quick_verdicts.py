@@ -6,7 +6,8 @@ import epigauge as eg
 import numpy as np
 import pytest
 from epigauge.kernels import available
-from epigauge.two_view import native, quick
+from epigauge.two_view import diagnostics, native, quick
+from epigauge.two_view.planes import share_on_a_plane
 from epigauge.two_view.refine import plan_of
 from two_views import Array, scene
 
@@ -77,6 +78,36 @@ def test_gross_errors_are_left_to_the_diagnosis(distance: float) -> None:
         x2[:2] += distance * rng.choice([-1.0, 1.0], (2, 2))
         assert "gross errors" in eg.refine_fundamental(x1, x2, backend="numpy").flags
         assert quickly(x1, x2)[0] is None
+
+
+@needs_c
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.8])
+def test_c_counts_on_the_plane_what_numpy_counts(share: float, monkeypatch) -> None:
+    rng = np.random.default_rng(5)
+    m, on = 100, round(100 * share)
+    X = np.column_stack([rng.uniform(-2.0, 2.0, (m, 2)), rng.uniform(4.0, 8.0, m)])
+    X[:on, 2] = 6.0 + 0.3 * X[:on, 0] - 0.2 * X[:on, 1]
+    Y = X + np.array([0.8, 0.1, 0.2])
+    x1, x2 = (
+        500.0 + 900.0 * Z[:, :2] / Z[:, 2:] + 0.3 * rng.standard_normal((m, 2)) for Z in (X, Y)
+    )
+    counted: list[float] = []
+    own_flags, own_doubt = quick.flags, diagnostics.is_suspicious
+
+    def flags(own, scale):
+        counted.append(own.on_plane)
+        return own_flags(own, scale)
+
+    def is_suspicious(found):
+        counted.append(share_on_a_plane(found))
+        return own_doubt(found)
+
+    monkeypatch.setattr(quick, "flags", flags)
+    monkeypatch.setattr(diagnostics, "is_suspicious", is_suspicious)
+    quickly(x1, x2)
+    _ = eg.refine_fundamental(x1, x2, backend="numpy").flags
+    assert counted[0] == pytest.approx(counted[1], abs=1e-12)
+    assert share - 0.1 < counted[0] < share + 0.25
 
 
 @needs_c
