@@ -116,6 +116,7 @@ class Scratch:
             by_target.setdefault(target, []).append((options, Path(entry["file"])))
         wanted = "epigauge_kernels_v3" if avx2 else "epigauge_kernels"
         yield from by_target.get(wanted, by_target["epigauge_kernels"])
+        yield from by_target["epigauge_digest"]
 
     def environment(self) -> dict[str, str]:
         """Return what has to be set so that Python finds the copy."""
