@@ -198,23 +198,39 @@ EG_EXPORT int eg_judge(ptrdiff_t m, const double *F, const double *q1, const dou
     return 1;
 }
 
-/* F by least squares, each match weighing as it is probably right; 0 where it has rank one. */
-static int refitted(eg_matches *matches, const eg_mixture_options *options, const double *fitted,
-                    const double *distances, const unsigned char *oriented, const double *from,
-                    double *F)
+/* As `losses.robust_scale`, of distances without signs, which are reordered. */
+static double robust_scale(double *sizes, ptrdiff_t n)
+{
+    return 1.4826 * (1.0 + 5.0 / (double)(n > 8 ? n - 7 : 1)) * eg_median(sizes, n);
+}
+
+/* Matches q1, q2 (2, m) in blocks: all of them, or those chosen, with their weights. */
+static void gather(eg_matches *matches, ptrdiff_t m, const double *q1, const double *q2,
+                   const double *weights, const unsigned char *chosen)
+{
+    ptrdiff_t n = 0;
+    for (ptrdiff_t i = 0; i < m; ++i) {
+        if (chosen && !chosen[i])
+            continue;
+        const ptrdiff_t begin = n - n % EG_BLOCK, size = eg_block_size(matches, begin);
+        double *q = eg_block_points(matches, begin) + n % EG_BLOCK;
+        q[0] = q1[i];
+        q[size] = q1[m + i];
+        q[2 * size] = q2[i];
+        q[3 * size] = q2[m + i];
+        matches->weights[n++] = weights ? weights[i] : 1.0;
+    }
+}
+
+/* F by least squares of weighted matches, near another; 0 where that has rank one. */
+static int least_squares(eg_matches *matches, const eg_mixture_options *options,
+                         const double *from, double *F)
 {
     static const eg_chart chart = {7, NULL, NULL};
     const eg_options how = {EG_REPROJECTION, EG_BLOCKS, EG_LINEAR, 1, 0, options->steps, 1.0,
                             options->ftol, 1e-12, 1e-14, 0.0, 0.0};
-    const ratios at = ratios_of(fitted, options->extent);
     double motion[EG_MOTION] = {0.0}, sigma;
     eg_outcome outcome;
-    for (ptrdiff_t i = 0; i < matches->m; ++i) {
-        const double squared = distances[i] * distances[i];
-        const double p = oriented[i] ? at.gain * exponential(at.by * squared) : 0.0;
-        const double near = at.halo > 0.0 ? at.halo * exponential(at.halo_by * squared) : 0.0;
-        matches->weights[i] = p / (1.0 + p + near);
-    }
     if (!eg_factorize(from, motion, motion + 9, &sigma))
         return 0;
     motion[18] = 1.0 / sqrt(1.0 + sigma * sigma);
@@ -222,6 +238,64 @@ static int refitted(eg_matches *matches, const eg_mixture_options *options, cons
     eg_minimize(matches, &how, &chart, motion, NULL, &outcome);
     memcpy(F, outcome.F, 9 * sizeof(double));
     return 1;
+}
+
+/* F by least squares, each match weighing as it is probably right; 0 where it has rank one. */
+static int refitted(eg_matches *matches, const eg_mixture_options *options, const double *fitted,
+                    const double *distances, const unsigned char *oriented, const double *from,
+                    double *F)
+{
+    const ratios at = ratios_of(fitted, options->extent);
+    for (ptrdiff_t i = 0; i < matches->m; ++i) {
+        const double squared = distances[i] * distances[i];
+        const double p = oriented[i] ? at.gain * exponential(at.by * squared) : 0.0;
+        const double near = at.halo > 0.0 ? at.halo * exponential(at.halo_by * squared) : 0.0;
+        matches->weights[i] = p / (1.0 + p + near);
+    }
+    return least_squares(matches, options, from, F);
+}
+
+/* Fit F to the matches within a limit until these stand still, as `Consensus.settle`: F, limit,
+   distances and sides are updated, the weights (m) are those of the matches. The limit falls to so
+   many deviations of the noise, unless that is 0. Returns how many fits that took; -1 where memory
+   ran out. */
+EG_EXPORT int eg_settle(ptrdiff_t m, const double *q1, const double *q2, const double *weights,
+                        const eg_mixture_options *options, double deviations, ptrdiff_t least,
+                        int most, double *F, double *limit, double *distances,
+                        unsigned char *oriented)
+{
+    double *room = malloc((size_t)(8 * m + 1) * sizeof *room);
+    unsigned char *inlier = calloc((size_t)m + 1, 1);
+    int fits = room && inlier ? 0 : -1;
+    while (fits >= 0 && fits < most) {
+        eg_matches matches = {0, room, room + 4 * m, room + 5 * m, room + 6 * m};
+        double *sizes = room + 7 * m, trial[9];
+        ptrdiff_t n = 0;
+        int stands = 1;
+        for (ptrdiff_t i = 0; i < m; ++i) {
+            const unsigned char within = weights[i] > 0.0 && oriented[i] &&
+                                         fabs(distances[i]) <= *limit;
+            stands &= within == inlier[i];
+            inlier[i] = within;
+            matches.m += within;
+        }
+        if (stands || matches.m < least)
+            break;
+        gather(&matches, m, q1, q2, weights, inlier);
+        if (!least_squares(&matches, options, F, trial))
+            break;
+        ++fits;
+        memcpy(F, trial, sizeof trial);
+        judge(m, q1, q2, options, F, NULL, distances, oriented, sizes);
+        for (ptrdiff_t i = 0; i < m; ++i)
+            if (inlier[i])
+                sizes[n++] = fabs(distances[i]);
+        if (deviations > 0.0)
+            *limit = fmin(*limit, fmax(deviations * robust_scale(sizes, n), 1e-9));
+    }
+    free(room);
+    free(inlier);
+    return fits;
 }
 
 /* Maximise the likelihood over F, deviation and share in turns, as `Consensus.climb`, from what
@@ -235,14 +309,7 @@ EG_EXPORT int eg_climb(ptrdiff_t m, const double *q1, const double *q2,
     if (room && sides) {
         eg_matches matches = {m, room, room + 4 * m, room + 5 * m, room + 6 * m};
         double *other = room + 7 * m, trial[9], own[FITTED];
-        for (ptrdiff_t begin = 0; begin < m; begin += EG_BLOCK) {
-            const ptrdiff_t n = eg_block_size(&matches, begin);
-            double *q = eg_block_points(&matches, begin);
-            for (int k = 0; k < 2; ++k) {
-                memcpy(q + k * n, q1 + k * m + begin, (size_t)n * sizeof(double));
-                memcpy(q + (2 + k) * n, q2 + k * m + begin, (size_t)n * sizeof(double));
-            }
-        }
+        gather(&matches, m, q1, q2, NULL, NULL);
         for (int turn = 0; turn < options->climbs; ++turn) {
             if (!refitted(&matches, options, fitted, distances, oriented, F, trial))
                 break;

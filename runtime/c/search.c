@@ -182,15 +182,16 @@ static double needed(search_t *s)
 }
 
 /* Improve the best proposal of a batch, where none before scored as high. Some of the matches judge
-   all proposals, all matches the finalists that do best. */
+   more proposals than finalists, all matches the finalists that do best. */
 static int improved(search_t *s, ptrdiff_t n, ptrdiff_t finalists, const double *proposals,
                     double *highest)
 {
     double first[3 * BATCH];
     const double *best = NULL;
     for (ptrdiff_t k = 0; k < n; ++k)
-        first[k] = agreement(s->scale2, s->floor2, s->judges, s->some, proposals + 9 * k,
-                             s->work);
+        first[k] = n <= finalists ? 0.0
+                                  : agreement(s->scale2, s->floor2, s->judges, s->some,
+                                              proposals + 9 * k, s->work);
     for (ptrdiff_t trial = 0; trial < finalists && trial < n; ++trial) {
         ptrdiff_t next = 0;
         for (ptrdiff_t k = 1; k < n; ++k)

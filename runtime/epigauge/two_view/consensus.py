@@ -27,7 +27,7 @@ from epigauge.two_view.chance import CEILING, chance_agreement, log10_false_alar
 from epigauge.two_view.conditioning import RMS
 from epigauge.two_view.criteria import Reprojection
 from epigauge.two_view.eliminated import EliminatedProblem
-from epigauge.two_view.losses import Loss
+from epigauge.two_view.losses import Loss, robust_scale
 from epigauge.two_view.mixture import Mixture
 from epigauge.two_view.parameterizations import Block, Parameterization
 
@@ -63,7 +63,10 @@ _SHARES = (0.02, 0.999)
 _CLIMBED = 1e-3
 _CLIMBS = 20
 
-#: Of a fit while climbing.
+#: Fits while the inliers settle, at most.
+_SETTLES = 20
+
+#: Of a fit while climbing, or settling.
 _STOPPING = lm.Stopping(ftol=1e-6, max_iter=10)
 
 #: Subsets drawn a round, by their size, how many of the best are climbed, and rounds at most.
@@ -260,6 +263,34 @@ class Consensus:
                 break
             best = trial
         return best
+
+    def settle(
+        self, found: Agreement, weights: Array, limit: float, deviations: float, least: int
+    ) -> tuple[Agreement, float, int]:
+        """Fit F to the inliers of some weight until these stand still.
+
+        Their largest distance falls to so many standard deviations of the noise, unless that is 0.
+        Returns the agreement, that distance, and how many fits it took: none where fewer agree than
+        are needed.
+        """
+        if self.criterion.kernels.compiled and isinstance(self.chart, Block):
+            start = np.ascontiguousarray(found.F), found.signed, found.oriented
+            choices = deviations, least, _SETTLES
+            (F, signed, oriented), limit, fits = mixture_native.settle(
+                *(*self._q, weights, start, limit, choices), self._options(RANGE)
+            )
+            return replace(found, F=F, signed=signed, oriented=oriented), limit, fits
+        before = np.zeros(len(weights), np.bool_)
+        for fits in range(_SETTLES):
+            inlier = found.inliers(limit) & (weights > 0.0)
+            if np.array_equal(inlier, before) or np.count_nonzero(inlier) < least:
+                return found, limit, fits
+            before, F = inlier, self.fitted(found.F, np.where(inlier, weights, 0.0))
+            signed, oriented = self.measured(F)
+            found = replace(found, F=F, signed=signed, oriented=oriented)
+            if deviations:
+                limit = min(limit, max(deviations * robust_scale(signed[inlier]), 1e-9))
+        return found, limit, _SETTLES
 
     def fitted(self, F: Array, weights: Array) -> Array:
         """Return the geometry of least squares near one."""

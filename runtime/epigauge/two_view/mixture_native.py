@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from epigauge._library import address, library
 from epigauge._native import check_sizes
 
-__all__ = ["Judged", "MixtureOptions", "climb", "judge"]
+__all__ = ["Judged", "MixtureOptions", "climb", "judge", "settle"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -42,12 +42,15 @@ class Judged(NamedTuple):
 
 
 @cache
-def _functions() -> tuple[Any, Any]:
+def _functions() -> tuple[Any, Any, Any]:
     check_sizes({"eg_mixture_options": MixtureOptions})
-    judge_, climb_ = library().eg_judge, library().eg_climb
+    pointer, size = ctypes.c_void_p, ctypes.c_ssize_t
+    judge_, climb_, settle_ = library().eg_judge, library().eg_climb, library().eg_settle
     for function in (judge_, climb_):
-        function.argtypes = [ctypes.c_ssize_t, *[ctypes.c_void_p] * 7]
-    return judge_, climb_
+        function.argtypes = [size, *[pointer] * 7]
+    numbers = ctypes.c_double, size, ctypes.c_int
+    settle_.argtypes = [size, *[pointer] * 4, *numbers, *[pointer] * 4]
+    return judge_, climb_, settle_
 
 
 def judge(
@@ -108,3 +111,48 @@ def climb(q1: Array, q2: Array, start: Judged, options: MixtureOptions) -> Judge
     if not done:
         raise MemoryError(f"no room for {q1.shape[1]} matches")
     return Judged(F, signed, oriented, *numbers.tolist())
+
+
+def settle(
+    q1: Array,
+    q2: Array,
+    weights: Array,
+    start: tuple[Array, Array, Mask],
+    limit: float,
+    choices: tuple[float, int, int],
+    options: MixtureOptions,
+) -> tuple[tuple[Array, Array, Mask], float, int]:
+    """Fit F to the matches within a limit until these stand still.
+
+    Parameters
+    ----------
+    q1, q2 : ndarray, shape (2, m)
+        Conditioned matches, contiguous.
+    weights : ndarray, shape (m,)
+        Of the matches; one without weight is never within.
+    start : tuple of ndarray, shape (3, 3), (m,), (m,)
+        F, distances and which matches are oriented.
+    limit : float
+        Largest distance.
+    choices : tuple of float, int, int
+        Deviations that the limit falls to, 0 for none; matches that are enough; fits at most.
+    options : MixtureOptions
+        How.
+
+    Returns
+    -------
+    tuple
+        As `start`, the limit, and how many fits that took.
+    """
+    F, signed, oriented = start[0].copy(), start[1].copy(), start[2].copy()
+    bound = np.array(limit)
+    fits = _functions()[2](
+        q1.shape[1],
+        *map(address, (q1, q2, weights)),
+        ctypes.addressof(options),
+        *choices,
+        *map(address, (F, bound, signed, oriented)),
+    )
+    if fits < 0:
+        raise MemoryError(f"no room for {q1.shape[1]} matches")
+    return (F, signed, oriented), float(bound), int(fits)

@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from epigauge import kernels
-from epigauge._arguments import as_array, as_count, as_matches, as_positive, as_score
+from epigauge._arguments import (
+    as_array,
+    as_count,
+    as_matches,
+    as_positive,
+    as_score,
+    as_weights,
+)
 from epigauge._logged import logged
 from epigauge._options import FrontEnd, RefineOptions, known_options
 from epigauge.errors import ArgumentError
@@ -65,7 +72,7 @@ class RobustResult(FundamentalResult):
     threshold_px : float
         Largest distance of an inlier.
     rounds : int
-        How many times F was refined before the inliers stood still.
+        How many times F was fitted before the inliers stood still.
     start : str
         Front end that gave the start: "native", "poselib", "opencv"; "8point" where it found
         nothing, "5point" of fewer than eight matches.
@@ -253,9 +260,11 @@ def estimated(
         raise ArgumentError("F0", "is given", "refine_fundamental, which starts from it")
     promise = None if score is None else as_score(score, len(x1))
     options.setdefault("noise_px", None)
+    given_weights = options.get("weights")
+    weights = np.ones(len(x1)) if given_weights is None else as_weights(given_weights, len(x1))
     raw = _Raw.of(x1, x2, options, least)
 
-    frame = raw.frame
+    frame, weights = raw.frame, weights[raw.rows]
     given = None if threshold is None else threshold / frame.scale
     agreed = raw.agreeing()
     consensus = agreed.consensus
@@ -274,17 +283,22 @@ def estimated(
         density = agreement.sigma, agreement.share, agreement.extent, agreement.about
         agreement = raw.consensus.judge(agreement.F, *density)
 
-    fit = _fitted(raw, agreement, given, options)
+    limit = _at_most(agreement.mixture.even) if given is None else given
+    settled = 0
+    if calibration is None:  # the refinement, with its options, is then hardly repeated
+        agreement, limit, settled = raw.consensus.settle(
+            *(agreement, weights * raw.is_near, limit),
+            *(_DEVIATIONS if given is None else 0.0, least),
+        )
+    fit = _fitted(raw, agreement, limit, given is not None, options)
     known = {
         "inlier": (fit.inlier if fit.is_open else fit.used)[raw.copies],
         "used": raw.rows[fit.used],
         "threshold_px": fit.limit_px,
-        "rounds": fit.rounds,
+        "rounds": settled + fit.rounds,
         "start": name,
     }
     plain = options["noise_px"] is None and options.get("loss", "linear") == "linear"
-    weights = of_matches(options, raw.count, raw.rows).get("weights")
-    weights = np.ones(len(raw.rows)) if weights is None else np.asarray(weights, float)
     asked = _Asked(raw, weights, fit, given is not None, fit.limit_px if plain else None)
     later = dict.fromkeys(("flags", "success"), asked.judged)
     later |= dict.fromkeys(("error_px", "p_wrong", "_signs"), asked.confident)
@@ -388,10 +402,14 @@ class _Fit(NamedTuple):
     is_open: bool
 
 
-def _fitted(raw: _Raw, agreement: Agreement, given: float | None, options: dict[str, Any]) -> _Fit:
-    """Refine F by its inliers until they stand still, within a distance that may be given."""
+def _fitted(
+    raw: _Raw, agreement: Agreement, limit: float, is_limited: bool, options: dict[str, Any]
+) -> _Fit:
+    """Refine F by its inliers until they stand still, within a distance that falls with the noise.
+
+    It does not where the caller has given it.
+    """
     scale = raw.frame.scale
-    limit = _at_most(agreement.mixture.even) if given is None else given
     inlier = raw.inliers(agreement, limit)
     fitted: set[bytes] = set()
     is_open = False
@@ -412,7 +430,7 @@ def _fitted(raw: _Raw, agreement: Agreement, given: float | None, options: dict[
         F = raw.frame.from_pixels(refined.F)
         signed, oriented = raw.consensus.measured(F)
         agreement = replace(agreement, F=F, signed=signed, oriented=oriented)
-        if given is None:
+        if not is_limited:
             sigma = robust_scale(agreement.signed[used])
             limit = min(limit, max(_DEVIATIONS * sigma, 1e-9))
         inlier = raw.inliers(agreement, limit)

@@ -263,17 +263,18 @@ class _Search:
         """Improve the best of a batch, where none before scored as high."""
         if not len(F):
             return highest
-        m = self.q.shape[1]
-        pool = m if self.order is None else (m + 1) // 2
-        judges = np.arange(min(pool, _JUDGES)) * pool // min(pool, _JUDGES)
-        judges = judges if self.order is None else self.order[judges]
-        first = self.agreement(F, self.q[:, judges])
-        chosen = np.argsort(-first, kind="stable")[:finalists]
-        scores = self.judged(F[chosen])
+        if len(F) > finalists:
+            m = self.q.shape[1]
+            pool = m if self.order is None else (m + 1) // 2
+            judges = np.arange(min(pool, _JUDGES)) * pool // min(pool, _JUDGES)
+            judges = judges if self.order is None else self.order[judges]
+            first = self.agreement(F, self.q[:, judges])
+            F = F[np.argsort(-first, kind="stable")[:finalists]]
+        scores = self.judged(F)
         best = int(np.argmax(scores))
         if not scores[best] > highest:
             return highest
-        self.improve(F[chosen[best]])
+        self.improve(F[best])
         return float(scores[best])
 
     def needed(self) -> float:
