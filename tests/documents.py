@@ -63,8 +63,9 @@ class Block:
 
 
 def pages() -> list[Path]:
-    """Return README and every page of the documentation with code that runs."""
-    found = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").rglob("*.md"))]
+    """Return README, that of packages, and every page of the documentation with code that runs."""
+    own = [CHECKOUT / "README.md", CHECKOUT / "packaging" / "README.md"]
+    found = [*own, *sorted((CHECKOUT / "docs").rglob("*.md"))]
     return [page for page in found if "_build" not in page.parts and blocks(page)]
 
 
