@@ -22,6 +22,7 @@ from epigauge.two_view.essential import Essential, Motion
 from epigauge.two_view.evidence import ROUNDING, Evidence, evidence
 from epigauge.two_view.five_point import log_cost
 from epigauge.two_view.homography import fit_homography
+from epigauge.two_view.joint import intersect
 from epigauge.two_view.losses import Loss
 from epigauge.two_view.solve import Matches, Options, Solution, joined, minimize
 
@@ -233,8 +234,8 @@ def _reversed(matches: Matches, options: Options, solution: Solution) -> Array |
     """Return a start for calibrated cameras with the relief of the scene reversed, if there is one.
 
     A narrow field of view hardly tells relief and motion from both mirrored in depth, in the plane
-    through the middle of the points across the line of sight of either camera. What five matches
-    lead to fits exactly.
+    through the middle of the points across the line of sight of either camera. Five matches say
+    nothing between the two: an E fits them exactly.
     """
     used = matches.weights > 0.0
     if options.calibration is None or np.count_nonzero(used) <= Essential.dimension:
@@ -244,14 +245,12 @@ def _reversed(matches: Matches, options: Options, solution: Solution) -> Array |
         return None
     R, t = motion.R, motion.t
     cameras = matches.calibrated(options.calibration)
-    rays1, rays2 = cameras.rays(matches.q1, matches.q2)
-    across = np.cross(rays1 @ R.T, rays2)
-    with np.errstate(all="ignore"):
-        depths = np.sum(np.cross(rays2, t) * across, axis=1) / np.sum(across**2, axis=1)
-    good = used & (depths > 0.0) & np.isfinite(depths)
+    h1, h2 = cameras.rays(matches.q1, matches.q2)
+    inverse_depths = intersect(np.column_stack([R, t]), h1[:, :2].T, h2[:, :2].T)[2]
+    good = used & (inverse_depths > 0.0)
     if not good.any():
         return None
-    middle1 = np.median(rays1[good] * depths[good, None], axis=0)
+    middle1 = np.median(h1[good] / inverse_depths[good, None], axis=0)
     middle2 = R @ middle1 + t
     side1, side2 = (np.eye(3) - 2.0 * np.outer(m, m) / (m @ m) for m in (middle1, middle2))
     turn = side2 @ R @ side1
