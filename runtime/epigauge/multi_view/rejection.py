@@ -52,7 +52,7 @@ _ANEW, _LISTED = 3, 5
 #: The set aside is settled when less than this share of the observations changes sides.
 _SETTLED = 1e-3
 
-
+#: No points.
 _NONE = np.zeros(0, np.intp)
 
 #: A point is at the centre of a camera where its image, both of unit norm in the normalised basis,
@@ -145,9 +145,7 @@ def with_set_aside(
 
 def _agreed(adjust: Adjust, search: GrossErrors, start: Any) -> BundleResult:
     """Adjust with a robust loss until the median distance stays the same."""
-    typical, proposed = search.typical(start), search.agreed(start)
-    start = proposed if search.typical(proposed) < typical else start
-    typical = np.inf
+    start, typical = min(start, search.agreed(start), key=search.typical), np.inf
     for _ in range(_ROBUST_ROUNDS):
         found = adjust(search.tracks, start, loss="cauchy", loss_scale_px="auto")
         if found.status == -2:
