@@ -31,7 +31,7 @@ from epigauge.two_view.losses import Loss, robust_scale
 from epigauge.two_view.mixture import Mixture
 from epigauge.two_view.parameterizations import Block, Parameterization
 
-__all__ = ["RANGE", "WIDEST", "Agreement", "Consensus"]
+__all__ = ["RANGE", "WIDEST", "Agreement", "Consensus", "narrowed"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -289,7 +289,7 @@ class Consensus:
             signed, oriented = self.measured(F)
             found = replace(found, F=F, signed=signed, oriented=oriented)
             if deviations:
-                limit = min(limit, max(deviations * robust_scale(signed[inlier]), 1e-9))
+                limit = narrowed(limit, deviations, signed[inlier])
         return found, limit, _SETTLES
 
     def fitted(self, F: Array, weights: Array) -> Array:
@@ -409,6 +409,11 @@ class Consensus:
         # (e' x q') . (F q)
         sign = np.sum(np.cross(epipole, self.h2, axisb=0, axisc=0) * line, axis=0)
         return np.asarray(sign > 0.0 if np.sum(np.sign(sign)) >= 0.0 else sign < 0.0)
+
+
+def narrowed(limit: float, deviations: float, signed: Array) -> float:
+    """Return the largest distance of an inlier, fallen to so many standard deviations of theirs."""
+    return min(limit, max(deviations * robust_scale(signed), 1e-9))
 
 
 #: Fields of an agreement that the compiled code knows, in its order.

@@ -36,7 +36,7 @@ from epigauge.two_view.homography_refine import (
 )
 from epigauge.two_view.homography_result import HomographyResult
 from epigauge.two_view.neighbours import ranked
-from epigauge.two_view.robust import of_matches
+from epigauge.two_view.robust_fit import of_matches
 from epigauge.two_view.search import SCALES
 
 __all__ = ["PlaneMixture", "estimate_homography"]

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, partial
-from types import SimpleNamespace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, NamedTuple, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epigauge import kernels
 from epigauge._arguments import (
-    as_array,
     as_count,
     as_matches,
     as_positive,
@@ -24,37 +19,18 @@ from epigauge._arguments import (
 from epigauge._logged import logged
 from epigauge._options import FrontEnd, RefineOptions, known_options
 from epigauge.errors import ArgumentError
-from epigauge.two_view import quick
-from epigauge.two_view.chance import chance_agreement
-from epigauge.two_view.conditioning import Conditioning, condition_raw
-from epigauge.two_view.confidence import Confidence, Signs, probability_below
-from epigauge.two_view.consensus import RANGE, WIDEST, Agreement, Consensus
-from epigauge.two_view.copies import contradicted, earliest
-from epigauge.two_view.covariance import untruncated
+from epigauge.two_view.confidence import Signs, probability_below
 from epigauge.two_view.essential_consensus import EssentialConsensus
-from epigauge.two_view.evidence import Evidence
 from epigauge.two_view.front_ends import checked, start
-from epigauge.two_view.losses import robust_scale
-from epigauge.two_view.refine import calibrations, refine_fundamental
+from epigauge.two_view.refine import calibrations
 from epigauge.two_view.result import FundamentalResult
-from epigauge.two_view.suspicion import log10_alarms
-from epigauge.verdicts import ordered
+from epigauge.two_view.robust_asked import Asked
+from epigauge.two_view.robust_fit import DEVIATIONS, Raw, at_most, fitted
 
-__all__ = ["Estimate", "RobustResult", "estimate_fundamental", "estimated", "of_matches"]
+__all__ = ["Estimate", "RobustResult", "estimate_fundamental", "estimated"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-#: Distance of an inlier in standard deviations of the noise, at most.
-_DEVIATIONS = 3.0
-
-_ROUNDS = 20
-
-#: So many matches that do not contradict each other are searched without the others.
-_ENOUGH = 14
-
-#: Options of `refine_fundamental` with one entry a match.
-_PER_MATCH = {"weights": 1, "covariance1": 3, "covariance2": 3}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -262,7 +238,7 @@ def estimated(
     options.setdefault("noise_px", None)
     given_weights = options.get("weights")
     weights = np.ones(len(x1)) if given_weights is None else as_weights(given_weights, len(x1))
-    raw = _Raw.of(x1, x2, options, least)
+    raw = Raw.of(x1, x2, options, least)
 
     frame, weights = raw.frame, weights[raw.rows]
     given = None if threshold is None else threshold / frame.scale
@@ -283,14 +259,14 @@ def estimated(
         density = agreement.sigma, agreement.share, agreement.extent, agreement.about
         agreement = raw.consensus.judge(agreement.F, *density)
 
-    limit = _at_most(agreement.mixture.even) if given is None else given
+    limit = at_most(agreement.mixture.even) if given is None else given
     settled = 0
     if calibration is None:  # the refinement, with its options, is then hardly repeated
         agreement, limit, settled = raw.consensus.settle(
             *(agreement, weights * raw.is_near, limit),
-            *(_DEVIATIONS if given is None else 0.0, least),
+            *(DEVIATIONS if given is None else 0.0, least),
         )
-    fit = _fitted(raw, agreement, limit, given is not None, options)
+    fit = fitted(raw, agreement, limit, given is not None, options)
     known = {
         "inlier": (fit.inlier if fit.is_open else fit.used)[raw.copies],
         "used": raw.rows[fit.used],
@@ -299,211 +275,13 @@ def estimated(
         "start": name,
     }
     plain = options["noise_px"] is None and options.get("loss", "linear") == "linear"
-    asked = _Asked(raw, weights, fit, given is not None, fit.limit_px if plain else None)
+    asked = Asked(raw, weights, fit, given is not None, fit.limit_px if plain else None)
     later = dict.fromkeys(("flags", "success"), asked.judged)
     later |= dict.fromkeys(("error_px", "p_wrong", "_signs"), asked.confident)
     return Estimate(
         RobustResult.partial(known | _cheap(fit.refined), lambda: asked.rest, **later),
         frame.scale * fit.agreement.signed[raw.copies],
     )
-
-
-@dataclass(frozen=True)
-class _Raw:
-    """All different matches, in pixels and conditioned.
-
-    Attributes
-    ----------
-    count : int
-        Matches as they were given.
-    rows, copies : ndarray of int
-        Which of these are here, shape (m,), and which of them each is, shape (count,).
-    x1, x2 : ndarray, shape (m, 2)
-        In pixels.
-    table : Table
-        Backend.
-    frame : Conditioning
-        Conditioned coordinates.
-    is_near : ndarray of bool, shape (m,)
-        Whether a match is not absurdly far from the others, where none agrees but by accident.
-    q : tuple of ndarray
-        The matches there.
-    consensus : Consensus
-        Of these.
-    least : int
-        How many are needed.
-    """
-
-    count: int
-    rows: NDArray[np.intp]
-    copies: NDArray[np.intp]
-    x1: Array
-    x2: Array
-    table: kernels.Table
-    frame: Conditioning
-    is_near: Mask
-    q: tuple[Array, Array]
-    consensus: Consensus
-    least: int
-
-    @staticmethod
-    def of(x1: Array, x2: Array, options: dict[str, Any], least: int) -> _Raw:
-        """Leave out copies, and refuse too few others."""
-        first = earliest(x1, x2)
-        rows = np.flatnonzero(first == np.arange(len(x1)))
-        if len(rows) < least:
-            raise ArgumentError(
-                "x1, x2", f"hold {len(rows)} different matches", f"at least {least}"
-            )
-        copies, m = np.searchsorted(rows, first), len(x1)
-        x1, x2 = x1[rows], x2[rows]
-        frame, is_near = condition_raw(x1, x2, least)
-        table = kernels.table(options.get("backend"))
-        q = frame.forward(x1, x2)
-        consensus = Consensus(table, *q)
-        return _Raw(m, rows, copies, x1, x2, table, frame, is_near, q, consensus, least)
-
-    def agreeing(self) -> _Raw:
-        """Return the matches that do not contradict each other, if they are enough to search."""
-        kept = ~contradicted(self.x1, self.x2)
-        if np.all(kept) or np.count_nonzero(kept) < _ENOUGH:
-            return self
-        q1, q2 = (np.ascontiguousarray(q[:, kept]) for q in self.q)
-        return replace(
-            self,
-            rows=self.rows[kept],
-            x1=self.x1[kept],
-            x2=self.x2[kept],
-            is_near=self.is_near[kept],
-            q=(q1, q2),
-            consensus=Consensus(self.table, q1, q2),
-        )
-
-    def inliers(self, agreement: Agreement, limit: float) -> Mask:
-        """Return the inliers, or the least number of nearest, of which the result means nothing."""
-        inlier = agreement.inliers(limit) & self.is_near
-        if np.count_nonzero(inlier) < self.least:
-            away = np.where(self.is_near, np.abs(agreement.signed), np.inf)
-            inlier = np.zeros(len(inlier), np.bool_)
-            inlier[np.argsort(away)[: self.least]] = True
-        return inlier
-
-
-class _Fit(NamedTuple):
-    """F of the inliers that stand still, in conditioned coordinates but for `refined`."""
-
-    refined: FundamentalResult
-    agreement: Agreement
-    used: Mask
-    inlier: Mask
-    limit: float
-    limit_px: float
-    rounds: int
-    is_open: bool
-
-
-def _fitted(
-    raw: _Raw, agreement: Agreement, limit: float, is_limited: bool, options: dict[str, Any]
-) -> _Fit:
-    """Refine F by its inliers until they stand still, within a distance that falls with the noise.
-
-    It does not where the caller has given it.
-    """
-    scale = raw.frame.scale
-    inlier = raw.inliers(agreement, limit)
-    fitted: set[bytes] = set()
-    is_open = False
-    while not is_open and inlier.tobytes() not in fitted and len(fitted) < _ROUNDS:
-        fitted.add(inlier.tobytes())
-        used, limit_px = inlier, limit * scale
-        F0: Array | None = raw.frame.to_pixels(agreement.F)
-        while True:
-            chosen = of_matches(options, raw.count, raw.rows[used])
-            try:
-                refined = refine_fundamental(raw.x1[used], raw.x2[used], F0, **chosen)
-                break
-            except ArgumentError as error:
-                if is_open or error.argument not in ("x1", "x2", "F0"):
-                    raise
-            # All that agree are in one place or on one line, and leave F open: fitted to all
-            used, F0, is_open = raw.is_near, None, True
-        F = raw.frame.from_pixels(refined.F)
-        signed, oriented = raw.consensus.measured(F)
-        agreement = replace(agreement, F=F, signed=signed, oriented=oriented)
-        if not is_limited:
-            sigma = robust_scale(agreement.signed[used])
-            limit = min(limit, max(_DEVIATIONS * sigma, 1e-9))
-        inlier = raw.inliers(agreement, limit)
-    return _Fit(refined, agreement, used, inlier, limit, limit_px, len(fitted), is_open)
-
-
-@dataclass(frozen=True)
-class _Asked:
-    """What is computed of a fit when it is asked for.
-
-    Attributes
-    ----------
-    raw, weights, fit
-        The matches, their weights (m,), and what was fitted.
-    is_limited : bool
-        Whether the caller gave the largest distance of an inlier.
-    cut_px : float or None
-        Where the noise is to be known without the cut that the largest distance makes.
-    """
-
-    raw: _Raw
-    weights: Array
-    fit: _Fit
-    is_limited: bool
-    cut_px: float | None
-
-    @cached_property
-    def near(self) -> tuple[Agreement, float, Mask]:
-        """The agreement of all, the distance up to which a match agrees, and which do."""
-        agreed, bound = self.fit.agreement, self.fit.limit
-        if not self.is_limited:  # real noise has heavier tails than three deviations of its core
-            agreed = self.raw.consensus.judge(agreed.F, agreed.sigma, agreed.share)
-            bound = max(bound, _at_most(agreed.mixture.even))
-        near = agreed.inliers(bound) & self.raw.is_near
-        return agreed, bound, near  # where fewer than 8, "no common geometry"
-
-    @cached_property
-    def among_all(self) -> Evidence:
-        """The evidence of all matches."""
-        _, bound, agreeing = self.near
-        raw, own = self.raw, self.fit.refined._evidence
-        return own.among(raw.x1, raw.x2, self.weights, agreeing, bound * raw.frame.scale)
-
-    def judged(self) -> SimpleNamespace:
-        """Return flags and success."""
-        raw, is_open, refined = self.raw, self.fit.is_open, self.fit.refined
-        agreed, bound, agreeing = self.near
-        pair = vars(refined).get("_pair")
-        if pair is not None and not is_open:  # cheap tests, where they suffice
-            scale = raw.frame.scale
-            flags, success = quick.verdict_of_raw(
-                *(pair, (raw.x1, raw.x2, self.weights), scale * agreed.signed, agreeing),
-                bound * scale,
-                partial(chance_agreement, raw.table, agreed.F, *raw.q, bound),
-            )
-            if flags is not None:
-                return SimpleNamespace(flags=flags, success=success)
-        verdict = refined.judged(self.among_all)
-        if is_open:
-            flags = ordered((*verdict.flags, "undetermined"))
-            verdict = SimpleNamespace(flags=flags, success=False)
-        return verdict
-
-    @cached_property
-    def rest(self) -> SimpleNamespace:
-        """All fields but those above."""
-        return _rest(self.fit.refined, self.cut_px)
-
-    def confident(self) -> SimpleNamespace:
-        """Return how likely the geometry is that of the scene."""
-        alarms, used = log10_alarms(self.among_all), self.fit.used
-        signs = Signs.of(self.rest._uncertainty, self.raw.x1[used], self.raw.x2[used], alarms)
-        return SimpleNamespace(_signs=signs, **vars(Confidence.of(signs)))
 
 
 class Estimate(NamedTuple):
@@ -518,35 +296,3 @@ def _cheap(refined: FundamentalResult) -> dict[str, Any]:
     later = {"flags", "success", "noise_px", "covariance", "_uncertainty"}
     names = type(refined).__dataclass_fields__.keys() - later
     return {name: value for name, value in vars(refined).items() if name in names}
-
-
-def _rest(refined: FundamentalResult, limit_px: float | None) -> SimpleNamespace:
-    """Return all fields but flags and success, the noise as a limit cuts it off undone."""
-    names = (entry.name for entry in fields(refined) if entry.name not in ("flags", "success"))
-    known = {name: getattr(refined, name) for name in names}
-    if limit_px is not None and refined.noise_px > 0.0:
-        # The threshold has cut off the tails of the right matches.
-        unit = math.sqrt(refined._evidence.unit)  # the limit is one of distances
-        noise_px = unit * untruncated(refined.noise_px / unit, limit_px)
-        factor = noise_px / refined.noise_px
-        spread = replace(refined._uncertainty, root=factor * refined._uncertainty.root)
-        known |= {"noise_px": noise_px, "_uncertainty": spread}
-        known["covariance"] = spread.of_fundamental()
-    return SimpleNamespace(**known)
-
-
-def _at_most(limit: float) -> float:
-    """Return a threshold that was not given, no larger than noise may be."""
-    return float(min(limit, WIDEST * RANGE))
-
-
-def of_matches(options: dict[str, Any], m: int, rows: NDArray[np.intp]) -> dict[str, Any]:
-    """Return the options with those that have one entry a match restricted to some."""
-    chosen = dict(options)
-    for name, dimensions in _PER_MATCH.items():
-        if options.get(name) is None:
-            continue
-        value = as_array(name, options[name], "an array with a row a match")
-        if value.ndim == dimensions and len(value) == m:
-            chosen[name] = value[rows]
-    return chosen
